@@ -8,8 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from canopen.sdo.exceptions import SdoCommunicationError
 from makes import write_eds
-from scenes import with_joints, without_torque
+from scenes import without_torque
 from undrawn import undrawn_run
 
 import canprobe
@@ -18,9 +19,10 @@ from canprobe.cell.master.controller import Command
 from canprobe.cell.master.options import RunOptions
 from canprobe.cell.session.session import Session
 from canprobe.errors import BusError, InterfaceError, NodeError
-from canprobe.fieldbus.bus.sdo import upload
+from canprobe.fieldbus.bus.candump import read_candump
+from canprobe.fieldbus.bus.sdo import read_value, upload
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
-from canprobe.fieldbus.eds.packaged import eds_path
+from canprobe.fieldbus.eds.packaged import eds_path, load_eds
 from canprobe.fieldbus.protocol.sdo import Abort, SdoAbort
 from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault
 
@@ -47,14 +49,21 @@ def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), sce
     return session
 
 
+def differing(acts):
+    """For `change`: something is done to some nodes, by their ids."""
+    return lambda node: acts.get(node.node_id, lambda _: None)(node)
+
+
+def at_node(node_id, act):
+    return differing({node_id: act})
+
+
 def done_to(session):
     """What bring-up says of each node, in their order."""
     return [line.split(") ", 1)[1] for line in session.said if re.match(r"node \d+: \(.*\) configur", line)]
 
 
 def frames(tmp_path):
-    from canprobe.fieldbus.bus.candump import read_candump
-
     return [(t, can_id, data) for t, _, can_id, data in read_candump(tmp_path / "bus.log")]
 
 
@@ -103,8 +112,6 @@ def is_write(can_id, data):
 
 REFUSED = {
     "a heartbeat of our own id": (sending(0x77F, "05"), BusError),
-    "SYNC": (sending(0x080, ""), BusError),
-    "an NMT command": (sending(0x000, "0103"), BusError),
     "Ctrl-C": (raising(KeyboardInterrupt()), KeyboardInterrupt),
     "the interface is lost": (raising(InterfaceError("can0: lost")), InterfaceError),
 }
@@ -116,21 +123,15 @@ def test_what_did_not_take_over_the_nodes_sends_nothing(tmp_path, what):
     with pytest.raises(kind) as refused:
         open_session(tmp_path, beside=[Somebody(act)]).__enter__()
     assert kind is not BusError or str(refused.value).endswith("another master is at work here; stop it first")
-    sent = [frame for frame in frames(tmp_path) if frame[0] < 100 * MS or frame[1] not in (0x77F, 0x080, 0x000)]
+    sent = [frame for frame in frames(tmp_path) if frame[0] < 100 * MS or frame[1] != 0x77F]
     assert sorted(i for _, i, _ in sent) == [0x700 + n for n in range(1, 7)], "the nodes' boot-ups and nothing else"
     assert len(frames(tmp_path)) - len(sent) == (kind is BusError)
-
-
-def refuse_a_write(node):
-    if node.node_id == 3:
-        node.dictionary.entries.pop(0x606000)
 
 
 FAILED = {
     "Ctrl-C at the reset": ({"beside": [Somebody(raising(KeyboardInterrupt()), is_reset)]}, KeyboardInterrupt),
     "Ctrl-C while they are configured": ({"beside": [Somebody(raising(KeyboardInterrupt()), is_write)]}, BaseException),
     "SYNC after the reset": ({"beside": [Somebody(sending(0x080, ""), is_write)]}, BusError),
-    "a value is refused": ({"change": refuse_a_write}, NodeError),
 }
 
 
@@ -164,14 +165,6 @@ def test_the_nodes_are_configured_side_by_side(tmp_path):
         assert max(counts) - min(counts) <= 2
 
 
-def test_a_lost_answer_is_asked_for_again(tmp_path):
-    lost = Fault(BUS_FAULTS["drop"], 3, 300 * MS, 300 * MS)
-    with open_session(tmp_path, faults=[lost]) as session:
-        done = done_to(session)
-    assert done.pop(2) == "configured, software 1.0, 1 requests repeated"
-    assert done == ["configured, software 1.0"] * 5
-
-
 def test_a_node_that_does_not_answer_is_named_with_the_entry(tmp_path):
     mute = Fault(BUS_FAULTS["drop"], 3, 300 * MS, 9000 * MS)
     with pytest.raises(NodeError, match=r"node 3: \(joint 3\) read of 1018h:01 failed: No SDO response") as failed:
@@ -183,154 +176,138 @@ def test_a_node_that_does_not_answer_is_named_with_the_entry(tmp_path):
     assert len([t for t in others if t < times[1]]) > 20, "the others did not wait for node 3"
 
 
-def test_all_that_failed_is_told(tmp_path):
-    def refuse(node):
-        if node.node_id in (2, 5):
-            node.dictionary.entries.pop(0x606000)
-
-    with pytest.raises(NodeError) as failed:
-        open_session(tmp_path, change=refuse).__enter__()
-    text = str(failed.value)
-    assert text.startswith("node 2: (joint 2) write of 6060h:00 = ")
-    assert "; node 5: (joint 5) write of 6060h:00 = " in text and text.count("failed: Code 0x06090011") == 2
+def lacking(index, subindex=0):
+    return lambda node: node.dictionary.entries.pop(index << 8 | subindex)
 
 
-def forgetting(index, value):
-    """For `change`: node 4 holds another value than is written to an object."""
-
-    def forget(node):
-        if node.node_id == 4:
-            node.dictionary.on_write(index, lambda sub, _: node.dictionary.put(index, sub, value))
-
-    return forget
+def holding(index, value):
+    """It holds another value than is written."""
+    return lambda node: node.dictionary.on_write(index, lambda sub, _: node.dictionary.put(index, sub, value))
 
 
-def test_a_required_value_that_does_not_stay_is_told(tmp_path):
-    with pytest.raises(NodeError, match=r"node 4: \(joint 4\) 1017h:00 reads back 0x7 after 0x64 was written"):
-        open_session(tmp_path, change=forgetting(0x1017, 7)).__enter__()
+def of_identity(subindex, number):
+    return lambda node: node.dictionary.set_default(0x1018, subindex, number)
 
 
-def test_a_wished_value_that_the_device_refuses_or_changes_is_reported_and_left(tmp_path):
-    def change(node):
-        forgetting(0x6066, 7)(node)
-        if node.node_id == 2:
-            node.dictionary.entries.pop(0x101601)
+def with_interpolation(subindex, value, fits):
+    """60C2h as delivered; what is written to it is refused unless it fits."""
 
-    with open_session(tmp_path, change=change) as session:
-        assert done_to(session) == ["configured, software 1.0"] * 6
-    assert session.cell.notes.lines() == []
-    remarks = [line for line in session.said if "left as the device has it" in line]
-    assert remarks == [
-        "node 2: (joint 2) write of 1016h:01 = 0x7f00fa failed: Code 0x06090011, Subindex does not exist: left as"
-        " the device has it (the node notices a dead master): the device will not notice a dead master",
-        "node 4: (joint 4) 6066h:00 reads back 0x7 after 0x32 was written: left as the device has it (following error"
-        " time-out): a drive that lags is given as long as the device has it",
-    ]
-
-
-def test_another_expression_of_the_interpolation_time_is_tried(tmp_path):
-    def refuse_tenths(node):
-        if node.node_id == 5:
-            node.dictionary.set_default(0x60C2, 2, -3)
-            node.dictionary.on_check(0x60C2, refuse)
-
-    def refuse(subindex, value):
-        if subindex == 2 and value == -4:
+    def refuse(*written):
+        if not fits(*written):
             raise SdoAbort(Abort.VALUE)
 
-    nodes = {}
-    with open_session(tmp_path, change=refuse_tenths, nodes=nodes) as session:
-        held = {n: tuple(node.dictionary.number(0x60C2, sub) for sub in (1, 2)) for n, node in nodes.items()}
-    assert held == {n: (25, -4) if n != 5 else (250, -5) for n in range(1, 7)}
-    (remark,) = [line for line in session.said if "means the same" in line]
-    assert remark.startswith("node 5: (joint 5) takes 60C2h:01 = 250, 60C2h:02 = -5")
+    def change(node):
+        node.dictionary.set_default(0x60C2, subindex, value)
+        node.dictionary.on_check(0x60C2, refuse)
+
+    return change
 
 
-@pytest.mark.parametrize("refuses", [True, False])
-def test_bits_29_and_30_of_a_cob_id_stay_as_the_device_has_them(tmp_path, refuses):
-    """It refuses to clear bit 30, or holds it whatever is written."""
+def never(*_):
+    return False
+
+
+def with_bit_30(node):
+    """TPDOs whose COB-IDs have bit 30: the device refuses to clear it, or holds it whatever is written."""
     rtr_off = 1 << 30
-
-    def keep(node):
-        if node.node_id != 3:
-            return
-        for index in range(0x1800, 0x1804):
-            node.dictionary.set_default(index, 1, node.dictionary.number(index, 1) | rtr_off)
-            if refuses:
-                node.dictionary.on_check(index, refuse)
-            else:
-                node.dictionary.on_write(index, lambda s, v, i=index: node.dictionary.put(i, s, v | rtr_off * (s == 1)))
 
     def refuse(subindex, value):
         if subindex == 1 and not value & rtr_off:
             raise SdoAbort(Abort.VALUE)
 
+    def keep(index):
+        return lambda sub, value: node.dictionary.put(index, sub, value | rtr_off * (sub == 1))
+
+    for index in range(0x1800, 0x1804):
+        node.dictionary.set_default(index, 1, node.dictionary.number(index, 1) | rtr_off)
+    node.dictionary.on_check(0x1800, refuse)
+    node.dictionary.on_write(0x1801, keep(0x1801))
+
+
+ACCEPTED = {
+    1: (
+        of_identity(3, 0x1_0004),
+        "has revision 00010004h, puma260_joint.eds describes 00010000h: the same major revision, taken",
+    ),
+    2: (
+        lacking(0x1016, 1),
+        "write of 1016h:01 = 0x7f00fa failed: Code 0x06090011, Subindex does not exist: left as the device has it"
+        " (the node notices a dead master): the device will not notice a dead master",
+    ),
+    3: (with_bit_30, None),
+    4: (
+        holding(0x6066, 7),
+        "6066h:00 reads back 0x7 after 0x32 was written: left as the device has it (following error time-out): a drive"
+        " that lags is given as long as the device has it",
+    ),
+    5: (
+        with_interpolation(2, -3, lambda subindex, value: (subindex, value) != (2, -4)),
+        "takes 60C2h:01 = 250, 60C2h:02 = -5, which means the same as what it refused",
+    ),
+    6: (with_interpolation(1, 25, never), None),
+}
+
+
+def test_what_a_device_has_otherwise_and_may_is_remarked_and_taken(tmp_path):
     nodes = {}
-    with open_session(tmp_path, change=keep, nodes=nodes) as session:
+    acts = {node_id: act for node_id, (act, _) in ACCEPTED.items()}
+    with open_session(tmp_path, change=differing(acts), nodes=nodes) as session:
         assert done_to(session) == ["configured, software 1.0"] * 6
-        assert nodes[3].dictionary.number(0x1800, 1) == 0x4000_0183
+        held = {n: tuple(node.dictionary.number(0x60C2, sub) for sub in (1, 2)) for n, node in nodes.items()}
+        assert [nodes[3].dictionary.number(index, 1) >> 30 & 1 for index in (0x1800, 0x1801)] == [1, 1]
+    assert held == {n: (25, -4) if n != 5 else (250, -5) for n in range(1, 7)}
+    assert session.cell.notes.lines() == []
+    remarks = [line for line in session.said if re.match(r"node \d: \(joint \d\) (?!configur)", line)]
+    assert remarks == [f"node {i}: (joint {i}) {remark}" for i, (_, remark) in ACCEPTED.items() if remark]
 
 
-def remarks(session):
-    """What bring-up remarks on nodes, but for what it did to them."""
-    lines = [line for line in session.said if re.match(r"node \d+: \(", line)]
-    return [line for line in lines if not re.match(r"node \d+: \(.*\) configur", line)]
+FAILING = {
+    1: (holding(0x1017, 7), "1017h:00 reads back 0x7 after 0x64 was written"),
+    2: (lacking(0x6060), "write of 6060h:00 = 0x8 failed: Code 0x06090011, Subindex does not exist"),
+    3: (of_identity(3, 0x2_0000), "1018h:03 revision number expected 0x10000, got 0x20000"),
+    4: (of_identity(3, 0xFFFF), "1018h:03 revision number expected 0x10000, got 0xffff"),
+    5: (with_interpolation(1, 0, never), "it holds 0x0"),
+    # 2.5 ms lie between 3 ms and 2 ms
+    6: (
+        with_interpolation(2, -3, lambda subindex, value: subindex == 1 or value == -3),
+        "it counts in 10^-3 s: cycle.rate_hz = 333.333 or cycle.rate_hz = 500 fits it",
+    ),
+}
 
 
-@pytest.mark.parametrize(
-    ("entries", "told"),
-    [
-        ({}, None),
-        ({(0x6092, 1): 2000}, "counts 2000 units a motor turn by its 6092h"),
-        ({(0x6092, 1): 2000, (0x6091, 1): 2}, None),
-        ({(0x6091, 2): 2}, "counts 2000 units a motor turn by its 6092h and 6091h"),
-        ({(0x6092, 1): 0}, None),
-        ({(0x6092, 2): 0}, None),
-        ({(0x6092, 2): None}, None),
-    ],
-)
-def test_units_of_the_device_are_compared_with_those_of_the_cell(tmp_path, entries, told):
-    """What fits is not remarked, and a quotient without sense is no statement."""
-
-    def change(node):
-        if node.node_id == 3:
-            for (index, subindex), value in entries.items():
-                node.dictionary.set_default(index, subindex, value or 0)
-                if value is None:
-                    node.dictionary.entries.pop(index << 8 | subindex)
-
-    with open_session(tmp_path, change=change) as session:
-        pass
-    assert [line.split(":")[0] for line in remarks(session)] == ([] if told is None else ["node 3"])
-    assert told is None or told in remarks(session)[0]
+def test_all_that_failed_is_told(tmp_path):
+    with pytest.raises(NodeError) as failed:
+        open_session(tmp_path, change=differing({node_id: act for node_id, (act, _) in FAILING.items()})).__enter__()
+    assert failed.value.node_id == 1
+    told = re.split(r"(?:^|; )node \d: \(joint \d\) ", str(failed.value))[1:]
+    assert [text.endswith(FAILING[i][1]) for i, text in enumerate(told, 1)] == [True] * 6, told
+    assert_left_pre_operational(tmp_path)
 
 
-@pytest.mark.parametrize(("revision", "taken"), [(0x1_0004, True), (0x2_0000, False), (0xFFFF, False)])
-def test_a_revision_of_the_same_major_number_is_taken(tmp_path, revision, taken):
-    def newer(node):
-        if node.node_id == 3:
-            node.dictionary.set_default(0x1018, 3, revision)
+def test_a_drive_that_keeps_its_interpolation_time_is_told_with_the_rate_that_fits_it(tmp_path):
+    told = r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed.* keeps 25 · 10\^-4 s: cycle.rate_hz = 400 fits it$"
+    change = at_node(5, with_interpolation(1, 25, never))
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, change=change, rate_hz=200.0).__enter__()
 
-    session = open_session(tmp_path, change=newer)
-    if taken:
-        with session:
-            (remark,) = [line for line in session.said if "revision" in line]
-        assert remark == (
-            "node 3: (joint 3) has revision 00010004h, puma260_joint.eds describes 00010000h: the same major revision,"
-            " taken"
-        )
-    else:
-        with pytest.raises(NodeError, match=rf"1018h:03 revision number expected 0x10000, got {revision:#x}"):
-            session.__enter__()
+
+def test_a_quotient_of_units_without_sense_is_no_statement(tmp_path):
+    acts = {
+        1: lambda node: node.dictionary.set_default(0x6092, 1, 0),
+        2: lambda node: node.dictionary.set_default(0x6092, 2, 0),
+        3: lacking(0x6092, 2),
+    }
+    with open_session(tmp_path, change=differing(acts)) as session:
+        assert done_to(session) == ["configured, software 1.0"] * 6
+    assert not any("units a motor turn" in line for line in session.said)
 
 
 def test_a_drive_in_another_mode_is_not_enabled(tmp_path):
     def stay(node):
-        if node.node_id == 2:
-            node.dictionary.on_read(0x6061, lambda sub: node.dictionary.put(0x6061, 0, 1))
+        node.dictionary.on_read(0x6061, lambda sub: node.dictionary.put(0x6061, 0, 1))
 
     told = r"^node 2: \(joint 2\) is in mode 1 \(6061h\) after 6060h = 8 was written"
-    with open_session(tmp_path, change=stay, enable_s=0.3) as session, pytest.raises(NodeError, match=told):
+    with open_session(tmp_path, change=at_node(2, stay), enable_s=0.3) as session, pytest.raises(NodeError, match=told):
         session.cell.run(lambda _: Command())
     words = {d[:2] for _, i, d in frames(tmp_path) if 0x201 <= i <= 0x206}
     assert words == {bytes(2)}, "no drive was switched on"
@@ -341,45 +318,35 @@ def test_a_drive_that_changes_its_mode_late_is_waited_for(tmp_path):
     answers = []
 
     def change(node):
-        if node.node_id == 2:
-            right = node.dictionary.number(0x6061)
-            node.dictionary.on_read(0x6061, lambda _: node.dictionary.put(0x6061, 0, answer(right)))
+        node.dictionary.on_read(0x6061, lambda _: node.dictionary.put(0x6061, 0, answer()))
 
-    def answer(right):
-        answers.append(right if session.buses.lockstep.clock.now_ns() > began + 200 * MS else 1)
-        return 8 if answers[-1] != 1 else 1
+    def answer():
+        answers.append(8 if session.buses.lockstep.clock.now_ns() > began + 200 * MS else 1)
+        return answers[-1]
 
-    with open_session(tmp_path, change=change, enable_s=0.3) as session:
+    with open_session(tmp_path, change=at_node(2, change), enable_s=0.3) as session:
         began = session.buses.lockstep.clock.now_ns()
         session.cell.run(lambda _: Command(done=True))
     assert answers.count(1) == len(answers) - 1 > 3
 
 
-def test_a_kept_configuration_is_not_written_again(tmp_path):
-    nodes = {}
-    logs, kept = [], []
-    for run in range(2):
-        with open_session(tmp_path, nodes=nodes, scene="press", store=True) as session:
-            kept.append(["kept" in done for done in done_to(session)])
-        nodes = {node_id: node.store.saved for node_id, node in nodes.items()}
-        logs.append(frames(tmp_path))
-        assert session.cell.notes.lines() == [], run
-    assert kept == [[False] * 7, [True] * 7]
-    assert len(writes_to(logs[0], 2)) > 25 and writes_to(logs[1], 2) == [(0x1016, 1)]  # the heartbeat consumer's end
-    assert writes_to(logs[1], 16) == [(0x2003, 0), (0x1016, 1)]  # and the tare, which is a command
+def test_a_kept_configuration_is_not_written_again_unless_the_scene_or_somebody_has_changed_it(tmp_path):
+    def brought_up(saved, **options):
+        """Which nodes kept their configuration, what they have stored, and what was sent."""
+        nodes = dict(saved)
+        with open_session(tmp_path, nodes=nodes, scene="press", store=True, **options) as session:
+            kept = ["kept" in done for done in done_to(session)]
+        assert session.cell.notes.lines() == []
+        return kept, {node_id: node.store.saved for node_id, node in nodes.items()}, frames(tmp_path)
 
-
-def test_another_scene_is_configured_anew_and_so_is_a_node_that_somebody_changed(tmp_path):
-    nodes = {}
-    with open_session(tmp_path, nodes=nodes, store=True):
-        pass
-    saved = {node_id: node.store.saved for node_id, node in nodes.items()}
-    nodes = dict(saved)
-    with open_session(tmp_path, nodes=nodes, rate_hz=200.0, store=True) as session:
-        assert not any("kept" in done for done in done_to(session))
+    kept, saved, log = brought_up({})
+    assert kept == [False] * 7 and len(writes_to(log, 2)) > 25
+    kept, saved, log = brought_up(saved)
+    assert kept == [True] * 7 and writes_to(log, 2) == [(0x1016, 1)], "the heartbeat consumer's end"
+    assert writes_to(log, 16) == [(0x2003, 0), (0x1016, 1)], "and the tare, which is a command"
+    assert brought_up(saved, rate_hz=200.0)[0] == [False] * 7
     saved[3] = {**saved[3], 0x102001: 0}
-    with open_session(tmp_path, nodes=dict(saved), store=True) as session:
-        assert ["kept" in done for done in done_to(session)] == [True, True, False, True, True, True]
+    assert brought_up(saved)[0] == [True, True, False, True, True, True, True]
 
 
 def test_any_write_over_sdo_takes_the_date_back():
@@ -405,8 +372,6 @@ def deaf_to_starts(number):
     """For `change`: node 3 does not hear its first NMT starts."""
 
     def deafen(node):
-        if node.node_id != 3:
-            return
         hear, left = node.receive, [number]
 
         def receive(can_id, data, t_ns):
@@ -417,7 +382,7 @@ def deaf_to_starts(number):
 
         node.receive = receive
 
-    return deafen
+    return at_node(3, deafen)
 
 
 def test_a_lost_start_is_sent_again(tmp_path):
@@ -427,81 +392,49 @@ def test_a_lost_start_is_sent_again(tmp_path):
     assert starts == [1, 2, 3, 4, 5, 6, 3, 3]
 
 
-def test_a_node_that_does_not_start_is_named(tmp_path):
-    told = r"node 3: \(joint 3\) is not operational 1 s after NMT start, 3 times: PRE_OPERATIONAL$"
-    with pytest.raises(NodeError, match=told):
-        open_session(tmp_path, change=deaf_to_starts(9)).__enter__()
-
-
-def answering_in_other_lengths(node):
-    """For `change`: each node answers SDO uploads in its own way, all of them legal or common."""
-    hear, rest = node.receive, []
-    ways = {1: "unsized", 2: "zeros", 3: "sign", 4: "segments"}
-
-    def receive(can_id, data, t_ns):
-        frames = [(i, changed(d) if i == 0x580 + node.node_id else d) for i, d in hear(can_id, data, t_ns)]
-        if can_id == 0x600 + node.node_id and data[0] == 0x60 and rest:
-            frames[:] = [(0x580 + node.node_id, bytes([7]) + rest.pop() + bytes(3))]  # the last one, 4 of 7 bytes
-        return frames
-
-    def changed(answer):
-        if answer[0] & 0xE3 != 0x43:  # expedited, with its size
-            return answer
-        value, way = answer[4 : 8 - (answer[0] >> 2 & 3)], ways.get(node.node_id)
-        if way == "unsized":
-            return b"\x42" + answer[1:4] + value.ljust(4, b"\x55")
-        longer = value.ljust(4, b"\xff" if way == "sign" and answer[1:4] == b"\xc2\x60\x02" else b"\0")
-        if way == "segments":
-            rest[:] = [longer]
-            return b"\x41" + answer[1:4] + bytes((4, 0, 0, 0))
-        return b"\x43" + answer[1:4] + longer if way else answer
-
-    node.receive = receive
-
-
-def test_an_answer_of_another_length_is_read_in_the_objects_own(tmp_path):
-    """CiA 301, SDO upload initiate: an expedited answer need not tell its size. 60C2h:02 is -4, an INTEGER8."""
-    with open_session(tmp_path, change=answering_in_other_lengths):
-        pass
-    answers = {d[0] for _, i, d in frames(tmp_path) if 0x581 <= i <= 0x584 and d[1:4] == b"\xc2\x60\x02"}
-    assert answers == {0x60, 0x42, 0x43, 0x41}
+def answered(place, *answers):
+    """What is read of an object of the drive by these answers."""
+    index, subindex = place
+    talk = read_value(load_eds("puma260_joint", 3)[index][subindex])
+    next(talk)
+    with pytest.raises(StopIteration) as ended:
+        for answer in answers:
+            talk.send(bytes.fromhex(answer))
+    return ended.value.value
 
 
 @pytest.mark.parametrize(
-    ("answer", "got"),
+    "answers",
     [
-        ("43 c2 60 01 19 01 00 00", "expected 1 byte, got 4: 19 01 00 00"),
-        ("4b c2 60 01 19 ff 00 00", "expected 1 byte, got 2: 19 ff"),
-        ("43 66 60 00 32 00 01 00", "expected 2 bytes, got 4: 32 00 01 00"),
-        ("4f 66 60 00 32 00 00 00", "expected 2 bytes, got 1: 32"),
+        ["42c26002fc555555"],
+        ["43c26002fc000000"],
+        ["43c26002fcffffff"],
+        ["41c2600204000000", "07fcffffff000000"],
+    ],
+    ids=["without a size", "zeros", "sign", "segments"],
+)
+def test_an_answer_of_another_length_is_read_in_the_objects_own(answers):
+    """CiA 301, SDO upload initiate: an expedited answer need not tell its size. 60C2h:02 is -4, an INTEGER8."""
+    assert answered((0x60C2, 2), *answers) == -4
+
+
+@pytest.mark.parametrize(
+    ("place", "answer", "told"),
+    [
+        ((0x60C2, 1), "43c2600119010000", "expected 1 byte, got 4: 19 01 00 00"),
+        ((0x60C2, 2), "43c2600219ffffff", "expected 1 byte, got 4: 19 ff ff ff"),
+        ((0x1A00, 1), "4f001a0132000000", "expected 4 bytes, got 1: 32"),
     ],
 )
-def test_a_value_that_does_not_fit_its_object_is_named(tmp_path, answer, got):
-    answer = bytes.fromhex(answer)
-
-    def change(node):
-        hear = node.receive
-        node.receive = lambda can_id, data, t_ns: [
-            (i, answer if i == 0x583 and d[1:4] == answer[1:4] and d[0] & 0xE0 == 0x40 else d)
-            for i, d in hear(can_id, data, t_ns)
-        ]
-
-    entry = f"{answer[2]:02X}{answer[1]:02X}h:{answer[3]:02X}"
-    with pytest.raises(NodeError, match=rf"^node 3: \(joint 3\) read of {entry} failed: {got}$"):
-        open_session(tmp_path, change=change).__enter__()
+def test_a_value_that_does_not_fit_its_object_is_refused(place, answer, told):
+    with pytest.raises(SdoCommunicationError, match=told):
+        answered(place, answer)
 
 
-def silent(node):
-    if node.node_id == 3:
-        node.receive = lambda can_id, data, t_ns: []
+silent = at_node(3, lambda node: setattr(node, "receive", lambda *_: []))
 
 
-def other_device(node):
-    if node.node_id == 3:
-        node.dictionary.set_default(0x1018, 2, 7)
-
-
-@pytest.mark.parametrize("change", [deaf_to_starts(9), silent, other_device, refuse_a_write])
+@pytest.mark.parametrize("change", [deaf_to_starts(9), silent, at_node(3, of_identity(2, 7))])
 def test_a_failure_ends_with_the_last_emcy_of_the_node(tmp_path, change):
     """Whatever it fails in; the EMCY came before anybody had spoken to it."""
     reports = Somebody(sending(0x083, "0050810000000000"))
@@ -509,13 +442,16 @@ def test_a_failure_ends_with_the_last_emcy_of_the_node(tmp_path, change):
         open_session(tmp_path, beside=[reports], change=change, boot_up_s=0.2).__enter__()
 
 
-def test_what_a_node_sent_before_we_listened_is_in_its_error_history(tmp_path):
+def test_a_node_that_does_not_start_is_named_with_what_it_sent_before_we_listened(tmp_path):
     def remember(node):
         deaf_to_starts(9)(node)
         if node.node_id == 3:
             node.dictionary.on_read(0x1003, lambda _: node.dictionary.put(0x1003, 1, 0x12345000))
 
-    told = r"PRE_OPERATIONAL; its error history \(1003h\) begins with 5000h, device hardware$"
+    told = (
+        r"node 3: \(joint 3\) is not operational 1 s after NMT start, 3 times: PRE_OPERATIONAL;"
+        r" its error history \(1003h\) begins with 5000h, device hardware$"
+    )
     with pytest.raises(NodeError, match=told):
         open_session(tmp_path, change=remember).__enter__()
 
@@ -552,8 +488,6 @@ def test_answers_that_come_far_too_late_are_told_with_the_way_out(tmp_path):
 
 
 def boots_twice(node):
-    if node.node_id != 3:
-        return
     hear = node.receive
 
     def receive(can_id, data, t_ns):
@@ -564,7 +498,7 @@ def boots_twice(node):
 
 
 def test_a_node_that_boots_twice_is_brought_up(tmp_path):
-    with open_session(tmp_path, change=boots_twice) as session:
+    with open_session(tmp_path, change=at_node(3, boots_twice)) as session:
         assert "node 3: (joint 3) sent 2 boot-ups after its reset" in session.said
 
 
@@ -597,76 +531,12 @@ def test_drives_that_cannot_say_what_they_have_stored_are_configured_each_time(t
     assert not any(index == 0x1010 for index, _ in writes_to(frames(tmp_path), 2))
 
 
-def test_drives_whose_file_has_oddities_that_nobody_uses_are_planned_and_run(tmp_path):
-    """Values and types that other tools read or that mean nothing, limits and a revision that nobody filled in."""
-    odd = [("0x7", "0.0"), ("0x15", "0x1234LL"), ("0x7", "0x00 00 01 00"), ("UDINT", "1"), ("", "1"), ("0x5", "off")]
-    text = eds_path("puma260_joint").read_text(encoding="ascii")
-    text = re.sub(r"(\[1018sub3\][^\[]*DefaultValue=)\w+", r"\g<1>0", text)
-    text = re.sub(r"\[607A\]", "[607A]\nLowLimit=0x7FFFFFFF\nHighLimit=0x80000000", text)
-    text = re.sub(r"\[(1017|60C2sub1)\]", r"[\1]\nLowLimit=0\nHighLimit=0", text)
-    for number, (kind, value) in enumerate(odd):
-        text += (
-            f"\n[5FF{number}]\nParameterName=X\nObjectType=7\nDataType={kind}\nAccessType=rw\nDefaultValue={value}\n"
-        )
-    (tmp_path / "odd.eds").write_text(text)
-    scene = canprobe.load_scene("free")
-    scene = replace(scene, arm=replace(scene.arm, eds=str(tmp_path / "odd.eds")))
-    assert canprobe.plan(scene).nodes[0].identity.revision_number is None
-    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.2)
-    assert result.summary["completed"] and result.summary["faults"] == []
-
-
-@pytest.mark.parametrize("fixed", [True, False])
-def test_drives_that_send_no_torque_are_run_and_logged_without(tmp_path, fixed):
-    scene = without_torque(canprobe.load_scene("free"), tmp_path, fixed=fixed)
+def test_drives_that_send_no_torque_are_run_and_logged_without(tmp_path):
+    scene = without_torque(canprobe.load_scene("free"), tmp_path, fixed=True)
     result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.1)
     assert result.summary["completed"] and result.summary["faults"] == []
     assert {"q_rad", "statusword"} <= set(result.log) and "torque_permille" not in result.log
     assert any(line.startswith("motor torque (torque_permille of log.npz): ") for line in result.summary["left_out"])
-
-
-def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):
-    """The scene names each drive's serial number; the nodes have others."""
-    session = open_session(tmp_path, change=lambda node: node.dictionary.set_default(0x1018, 4, 1000 + node.node_id))
-    swapped = Session(with_joints(session.scene, serial_number=(1001, 1002, 1004, 1003, 1005, 1006)))
-    swapped.buses.world.participants[:] = session.buses.world.participants
-    with (
-        pytest.raises(NodeError, match=r"1018h:04 serial number expected 0x3ec, got 0x3eb; .*; node 4: ") as failed,
-        swapped,
-    ):
-        pass
-    assert failed.value.node_id == 3
-
-
-@pytest.mark.parametrize(
-    ("kept", "takes", "rate_hz", "told"),
-    [
-        ((1, 25), (), 400.0, None),
-        ((1, 25), (), 200.0, r"write of 60C2h:01 = 0x32 failed.* keeps 25 · 10\^-4 s: cycle.rate_hz = 400 "),
-        ((1, 0), (), 400.0, r"; it holds 0x0$"),
-        # 2.5 ms lie between 3 ms and 2 ms
-        ((2, -3), (1,), 400.0, r"counts in 10\^-3 s: cycle.rate_hz = 333.333 or cycle.rate_hz = 500 fits"),
-    ],
-)
-def test_an_interpolation_time_that_cannot_be_written_must_be_the_right_one(tmp_path, kept, takes, rate_hz, told):
-    """25·10⁻⁴ s as delivered; the sub-indices of 60C2h that it takes, besides the value that it has."""
-
-    def fix(node):
-        def refuse(subindex, value):
-            if subindex not in takes and (not takes or value != kept[1]):
-                raise SdoAbort(Abort.READ_ONLY)
-
-        if node.node_id == 5:
-            node.dictionary.set_default(0x60C2, *kept)
-            node.dictionary.on_check(0x60C2, refuse)
-
-    session = open_session(tmp_path, change=fix, rate_hz=rate_hz)
-    if told is None:
-        with session:
-            assert done_to(session) == ["configured, software 1.0"] * 6
-    else:
-        with pytest.raises(NodeError, match=rf"^node 5: \(joint 5\).*{told}"):
-            session.__enter__()
 
 
 def test_a_drive_without_60c2h_follows_the_period_of_sync(tmp_path):

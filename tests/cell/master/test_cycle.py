@@ -24,10 +24,10 @@ class Port:
 
     stamps_arrival = True
 
-    def __init__(self, arrivals):
+    def __init__(self, arrivals=()):
         self._arrivals, self._coming = arrivals, []
         self.clock, self._now = self, 0
-        self.drains = 0
+        self.drains, self.sent = 0, []
 
     def now_ns(self):
         return self._now
@@ -36,6 +36,7 @@ class Port:
         self._now = max(self._now, t_ns)
 
     def send_batch(self, frames, t_ns=None):
+        self.sent += [(self._now, *frame) for frame in frames]
         if frames[0][0] == SYNC_ID:
             self._coming = sorted((self._now + us * 1000, can_id) for can_id, us in self._arrivals)
 
@@ -99,27 +100,24 @@ def goes_on_at(arrivals, *, on_arrival=True, drives=True):
 
 
 @pytest.mark.parametrize(
-    ("last_us", "begins_us", "looks"),
+    ("last_us", "begins_us", "looks", "in_lockstep_us"),
     [
-        (0, 0, 1),  # nodes on the same processor that go first
-        (300, 625, 2),
-        (900, 900, 3),  # no waiting for the next look
-        (1144, 1144, 3),
-        (1600, 1500, 3),  # late
+        (0, 0, 1, 625),  # nodes on the same processor that go first
+        (300, 625, 2, 625),
+        (900, 900, 3, 1145),  # no waiting for the next look, which lockstep has
+        (1144, 1144, 3, 1145),
+        (1600, 1500, 3, 1500),  # late
     ],
 )
-def test_on_a_running_clock_a_cycle_goes_on_once_the_last_tpdo_is_in(last_us, begins_us, looks):
-    assert goes_on_at([(TPDOS[0], 0), (TPDOS[1], last_us)]) == (begins_us, looks)
+def test_a_cycle_goes_on_once_the_last_tpdo_is_in_and_in_lockstep_at_a_look(last_us, begins_us, looks, in_lockstep_us):
+    arrivals = [(TPDOS[0], 0), (TPDOS[1], last_us)]
+    assert goes_on_at(arrivals) == (begins_us, looks)
+    assert goes_on_at(arrivals, on_arrival=False)[0] == in_lockstep_us
 
 
 def test_chatter_wakes_a_cycle_but_keeps_it_no_longer():
     chatter = [(0x7FF, us) for us in range(0, 2500, 10)]
     assert goes_on_at([(TPDOS[0], 100), *chatter])[0] == LOOKS[-1]
-
-
-@pytest.mark.parametrize(("last_us", "begins_us"), [(0, 625), (300, 625), (900, 1145), (1600, 1500)])
-def test_in_lockstep_it_goes_on_at_a_look(last_us, begins_us):
-    assert goes_on_at([(TPDOS[0], 0), (TPDOS[1], last_us)], on_arrival=False)[0] == begins_us
 
 
 def test_without_drives_there_is_nothing_to_go_on_with_before_the_first_look():
@@ -131,7 +129,7 @@ def test_without_drives_there_is_nothing_to_go_on_with_before_the_first_look():
 )
 def test_a_sync_more_than_half_a_period_late_is_an_overrun(late_periods, overruns, left_out):
     """The next deadline is on the grid of the first one: whole periods are left out, not caught up."""
-    port = Port([])
+    port = Port()
     cycle = a_cycle(port, drives=False)
     cycle.begin()
     cycle.end(None)
@@ -152,21 +150,6 @@ def test_an_array_that_was_never_heard_is_as_old_as_the_run():
     assert intake.measure(0).tactile_age == 20
 
 
-class Written(Port):
-    """A port that keeps what is sent."""
-
-    def __init__(self, arrivals=()):
-        super().__init__(arrivals)
-        self.sent = []
-
-    def send_batch(self, frames, t_ns=None):
-        super().send_batch(frames, t_ns)
-        self.sent += [(self._now, *frame) for frame in frames]
-
-    def send_on(self, channel, frames):
-        self.send_batch(frames)
-
-
 def cycled(cycle, number, *, work=False):
     for _ in range(number):
         cycle.begin()
@@ -176,7 +159,7 @@ def cycled(cycle, number, *, work=False):
 
 
 def test_the_heartbeat_goes_every_100_ms_behind_the_commands():
-    port = Written()
+    port = Port()
     cycle = a_cycle(port, drives=False)
     cycled(cycle, 82)
     beats = [(t_ns - cycle.t_first_ns) // PERIOD_NS for t_ns, can_id, data in port.sent if can_id == 0x77F]
@@ -187,35 +170,22 @@ def test_the_heartbeat_goes_every_100_ms_behind_the_commands():
 
 
 def test_every_fifth_cycle_is_timed_and_the_last_ones_are_kept():
-    cycle = a_cycle(Written(), drives=False)
+    cycle = a_cycle(Port(), drives=False)
     cycled(cycle, 11, work=True)
     statistics = cycle.statistics
     assert (len(statistics.period_error_ns), len(statistics.response_ns), len(statistics.compute_ns)) == (11, 3, 3)
     assert all(
         0 < response <= work for response, work in zip(statistics.response_ns, statistics.compute_ns, strict=True)
     )
-    kept = a_cycle(Written(), drives=False, kept=2)
+    kept = a_cycle(Port(), drives=False, kept=2)
     cycled(kept, 11, work=True)
     kept = kept.statistics
     assert (len(kept.period_error_ns), len(kept.response_ns), len(kept.compute_ns)) == (2, 2, 2)
 
 
-def test_a_cycle_that_comes_after_another_goes_on_on_its_grid():
-    port = Written()
-    first = a_cycle(port, drives=False)
-    cycled(first, 5)
-    port.sleep_until_ns(first.t_first_ns + round(19.3 * PERIOD_NS))
-    second = a_cycle(port, drives=False, before=first)
-    measurement = second.begin()
-    assert (measurement.cycle, measurement.t_ns) == (5, 20 * PERIOD_NS)
-    assert second.t_first_ns == first.t_first_ns and len(first.statistics.period_error_ns) == 6
-    assert first.begin().cycle == 5, "a cycle by itself"
-    assert a_cycle(port, drives=False).begin().t_ns == 0
-
-
 def test_frames_go_where_they_belong_and_what_came_before_a_sync_does_first():
     taken, left = [], []
-    port = Written([(0x583, 100), (0x703, 200), (TPDOS[0], 300), (TPDOS[1], 300)])
+    port = Port([(0x583, 100), (0x703, 200), (TPDOS[0], 300), (TPDOS[1], 300)])
     watch = SimpleNamespace(push=lambda can_id, *_: can_id == 0x703 and not taken.append(can_id))
     cycle = a_cycle(port, watch=watch, other=left.append)
     cycle.begin()
@@ -226,25 +196,6 @@ def test_frames_go_where_they_belong_and_what_came_before_a_sync_does_first():
     port.drain = lambda: at.append(len(port.sent)) or drain()
     cycle.begin()
     assert at[0] == 1 and at[1:] == [2] * (len(at) - 1), "one look before the second SYNC"
-
-
-def test_requests_to_the_array_go_out_with_the_cycle_that_makes_them():
-    port = Written()
-    array, counters = SimpleNamespace(cob_ids=(0x511,), newest_cycle=2, channel="can0"), []
-    array.take = lambda number, counter, *_: counters.append(counter)
-    array.requests = lambda number: [(0x600, bytes((number,)))] if number == 3 else []
-    cycle = a_cycle(port, drives=False, tactile=array)
-    cycled(cycle, 5)
-    assert [(t - cycle.t_first_ns, data) for t, can_id, data in port.sent if can_id == 0x600] == [
-        (3 * PERIOD_NS + LOOKS[0] * 1000, b"\x03")
-    ]
-    assert cycle.begin().tactile_age == 3
-    assert counters == [0] * 6, "this SYNC has no counter"
-
-
-def test_without_drives_a_cell_counts_as_enabled():
-    measurement = a_cycle(Written(), drives=False).begin()
-    assert measurement.enabled and measurement.q is None and measurement.tactile_age is None
 
 
 # Observers of a cell: what they see, and that they cannot harm it.
@@ -298,11 +249,6 @@ def test_an_observer_that_fails_is_left_out_and_the_run_goes_on(free, tmp_path):
     assert len(result.summary["faults"]) == 1
     assert len([o for o in watcher.seen if o.measurement]) == result.summary["cycle"]["cycles"]
     assert result.summary["cycle"]["observe_us"]["max"] > 0
-
-
-def test_without_observers_nothing_is_kept_and_nothing_is_said(free, tmp_path):
-    result = undrawn_run(free, out=tmp_path, duration_s=0.1)
-    assert result.summary["cycle"]["observe_us"] is None and result.summary["bridges"] is None
 
 
 def test_frames_without_a_cycle_do_not_pile_up():

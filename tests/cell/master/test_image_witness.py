@@ -31,12 +31,9 @@ def test_an_array_that_repeats_its_image_while_the_probe_moves_is_dead():
     assert look(ImageWitness(), [b"same"] * 100, scatter=0.0) == pytest.approx(FROZEN_NS, abs=PERIOD_NS)
 
 
-def test_at_rest_it_may_repeat_itself():
-    assert look(ImageWitness(), [b"same"] * 100, speed=0.0, scatter=0.0) is None
-
-
-def test_without_a_contact_it_may_repeat_itself():
-    assert look(ImageWitness(), [b"zero"] * 100, pressed=False, scatter=0.0) is None
+@pytest.mark.parametrize("how", [{"speed": 0.0}, {"pressed": False}])
+def test_at_rest_or_without_a_contact_it_may_repeat_itself(how):
+    assert look(ImageWitness(), [b"same"] * 100, scatter=0.0, **how) is None
 
 
 @pytest.mark.parametrize(("speed", "highest", "dead"), [(10e-3, 130, True), (1e-3, 130, False), (10e-3, 30, False)])

@@ -16,8 +16,7 @@ from canprobe.cell.master.supervision import limits_of
 from canprobe.cell.master.trail import ARRIVAL_S, WAY_BACK, WAY_BACK_SPEED, TakenWay
 from canprobe.cell.master.watch import NodeWatch
 from canprobe.errors import NodeError, SafetyStop
-from canprobe.fieldbus.protocol.emcy import Emcy
-from canprobe.fieldbus.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NmtState
+from canprobe.fieldbus.protocol.frames import HEARTBEAT_BASE, NmtState
 from canprobe.mechanics.robot.chain import forward
 from canprobe.mechanics.robot.model import joints_to_units
 
@@ -90,43 +89,6 @@ def a_watch():
 
 def lift(drives, watch=None, error=None):
     return LiftOff(PLAN, drives, watch or a_watch(), error or SafetyStop("the sensor is lost"))
-
-
-def missed(drives, watch):
-    drives.age[1] = 1
-
-
-def disabled(drives, watch):
-    drives.on[1] = False
-
-
-def alarmed(drives, watch):
-    watch.push(EMCY_BASE + 2, Emcy(0x4210, 1).pack(), 0)
-
-
-def stopped(drives, watch):
-    watch.push(HEARTBEAT_BASE + 2, bytes((NmtState.STOPPED,)), 0)
-
-
-def never_heard(drives, watch):
-    del watch.states[2]
-
-
-@pytest.mark.parametrize("trouble", [missed, disabled, alarmed, stopped, never_heard])
-def test_a_drive_in_trouble_is_stopped_and_the_others_lift(trouble):
-    drives, watch = Drives(), a_watch()
-    trouble(drives, watch)
-    going = lift(drives, watch)
-    assert going.possible
-    going.begin()
-    assert drives.targets.stopped == {2}
-
-
-def test_the_node_that_the_cell_is_stopped_for_does_not_lift_and_others_do():
-    for error, still in ((NodeError(3, "lost"), {3}), (NodeError(16, "lost"), set()), (SafetyStop("node 3"), set())):
-        drives = Drives()
-        lift(drives, error=error).begin()
-        assert drives.targets.stopped == still
 
 
 def test_a_drive_that_moves_otherwise_than_told_is_braked_by_its_place_and_not_by_its_quick_stop():

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from canprobe.cell.master.cycle import CycleStatistics
 from canprobe.cell.master.log import RunLog
 from canprobe.cell.master.notes import KINDS_KEPT, OTHER_KINDS_TEXT, Notes, nodes_text
 
@@ -42,16 +41,7 @@ def test_what_a_row_lacks_is_nan_and_what_nobody_knows_too():
     np.testing.assert_array_equal(columns["c"], [np.nan] * 3)
 
 
-def test_a_value_of_another_shape_costs_only_itself():
-    log = RunLog()
-    for row in ({"a": np.ones(3)}, {"a": np.ones(2)}, {"a": "x"}, {"a": np.full(3, 2.0)}):
-        log.add(row)
-    with pytest.warns(UserWarning, match=r"2 values of column 'a' are no numbers of shape \(3,\)"):
-        columns = log.arrays()
-    np.testing.assert_array_equal(columns["a"], [[1.0] * 3, [np.nan] * 3, [np.nan] * 3, [2.0] * 3])
-
-
-def test_rows_of_other_names_have_no_other_shape():
+def test_a_value_of_another_shape_costs_only_itself_in_rows_of_other_names_too():
     log = RunLog()
     for row in ({"a": 1.0}, {"a": np.ones(3), "b": 2.0}, {"b": 3, "a": 4}, {"a": 10**400}, {"a": 5.0}):
         log.add(row)
@@ -72,23 +62,6 @@ def test_a_column_has_the_shape_of_its_first_number_and_rows_before_it_are_nan()
     assert np.isnan(columns["c"]).all() and len(columns["c"]) == 3
     log.add({"a": np.ones(2), "b": 4.0})
     assert "c" not in log.columns(), "none of the rows that are kept has it"
-
-
-def test_a_controller_may_write_into_what_it_gave():
-    log, value = RunLog(), np.zeros(2)
-    for k in range(3):
-        value[:] = k
-        log.add({"a": value, "b": k if k else None})
-    np.testing.assert_array_equal(log.arrays()["a"], [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])
-
-
-def test_statistics_of_the_last_cycles():
-    kept, all_ = CycleStatistics.of_last(3), CycleStatistics.of_last(None)
-    for statistics in (kept, all_):
-        for k in range(5):
-            statistics.period_error_ns.append(k)
-    assert list(kept.period_error_ns) == [2, 3, 4]
-    assert len(all_.period_error_ns) == 5
 
 
 # What is lived with is told once a kind, with how often, to whom and when.

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from canprobe.cell.master.conditions import BY_KEY, CONDITIONS, COUNTERS
+from canprobe.cell.master.conditions import BY_KEY, CONDITIONS
 from canprobe.cell.master.controller import Measurement
 from canprobe.cell.master.drives import DriveAxis
 from canprobe.cell.master.supervision import CycleState, Limits, Reaction, TouchState
@@ -26,11 +26,15 @@ LIMITS = Limits(SafetyLimits(5.0, 0.15, 0.0, 1.0, 0.8, None), period_ns=2_500_00
 SCANNING = replace(LIMITS, regain=3e-3)
 TARING = replace(LIMITS, tares=True)
 COMMUNICATION, TEMPERATURE = Emcy(0x8210, 0x11).pack(), Emcy(0x4210, 0x09).pack()
-PASSIVE = {"controller_state": ControllerState.PASSIVE}
 
 
 def seen(limits=LIMITS, **fields):
     return CycleState(limits, NodeWatch((1, 2)), None, None, PortCounters(), **fields)
+
+
+def passive(time_ns):
+    """A cell whose CAN controller has been error-passive for a time."""
+    return seen(passive_ns=time_ns, controller_state=ControllerState.PASSIVE)
 
 
 def with_ages(*ages):
@@ -88,14 +92,9 @@ def felt(**patch):
         ("drive_late", with_ages(0, 2), with_ages(0, 3), "node 2: no usable TPDO for 3 cycles"),
         ("drive_silent", with_ages(5, 0), with_ages(6, 0), "node 1: lost: no usable TPDO for 6 cycles"),
         ("overruns", seen(late_share=0.8), seen(late_share=0.81), "81.0 % of the last second's cycles"),
-        (
-            "error_passive_long",
-            seen(passive_ns=1_000_000_000, **PASSIVE),
-            seen(passive_ns=1_002_500_000, **PASSIVE),
-            "error-passive for 1.0 s",
-        ),
-        ("error_passive", seen(), seen(passive_ns=1_000_000_000, **PASSIVE), "error-passive"),
-        ("bus_off", seen(**PASSIVE), seen(controller_state=ControllerState.BUS_OFF), "bus-off"),
+        ("error_passive_long", passive(1_000_000_000), passive(1_002_500_000), "error-passive for 1.0 s"),
+        ("error_passive", passive(1_000_000_001), passive(1_000_000_000), "error-passive"),
+        ("bus_off", passive(0), seen(controller_state=ControllerState.BUS_OFF), "bus-off"),
         ("force_hidden", touch(hidden_s=0.02), touch(hidden_s=0.0201), "force is above the 2.0 N measured"),
         ("off_pad", touch(off_pad_s=0.02), touch(off_pad_s=0.0201), "runs off the edge of the array"),
         ("taxels_hidden", touch(bridged_s=0.02), touch(bridged_s=0.0201, bridged=0.6), "60 % of the force"),
@@ -107,59 +106,22 @@ def felt(**patch):
         ("force_fell", touch(depth=depth(0.0499)), touch(depth=depth(0.0501)), "fell from 2.00 to 0.50 N within 5 ms"),
         ("contact_lost", touch(lost_s=0.1, depth=depth(0.01)), touch(lost_s=0.1), "contact lost"),
         ("contact_to_regain", scan(0.1, depth=depth(0.01)), scan(0.1), "contact lost"),
-        (
-            "depth",
-            touch(depth=depth()),
-            touch(depth=depth(contradicts=True)),
-            "measures 2.00 N where the probe's depth",
-        ),
-        (
-            "depth",
-            touch(depth=depth()),
-            touch(depth=depth(contradicts=True, wandered=1.2e-3)),
-            "1.2 mm aside in a touch",
-        ),
-        (
-            "push_unfelt",
-            seen(),
-            seen(unfelt=3.4, patch=felt(force=0.2)),
-            "a push of 3.4 N beyond the 0.20 N that the array",
-        ),
+        ("depth", touch(depth=depth()), touch(depth=depth(contradicts=True)), "2.00 N where the probe's depth"),
+        ("depth", touch(depth=depth()), touch(depth=depth(contradicts=True, wandered=1.2e-3)), "1.2 mm aside"),
+        ("push_unfelt", seen(), seen(unfelt=3.4, patch=felt(force=0.2)), "3.4 N beyond the 0.20 N that the array"),
         ("contact_not_regained", scan(searched=3e-3), scan(searched=3.01e-3), "not found again within 3.0 mm"),
         ("preload", seen(TARING, preload=0.15), seen(TARING, preload=0.151), "measures 0.15 N before the run"),
         ("preload", seen(preload=0.2), seen(TARING, preload=0.2), "limits.preload_max_n = 0.15"),
         ("joint_speed", seen(), seen(speeding="joint 2 reports a motion"), "joint 2 reports a motion"),
         ("log", seen(), seen(log_failure="bus.log: cannot be written"), "bus.log: cannot be written"),
         ("foreign_master", heard(HEARTBEAT_BASE + 1, 5), heard(SYNC_ID), "another master is on the bus: SYNC"),
-        (
-            "nmt_state",
-            heard(HEARTBEAT_BASE + 2, 5),
-            heard(HEARTBEAT_BASE + 2, 4),
-            "node 2: left operation: NMT state STO",
-        ),
+        ("nmt_state", heard(HEARTBEAT_BASE + 2, 5), heard(HEARTBEAT_BASE + 2, 4), "2: left operation: NMT state STO"),
         ("emcy", heard(EMCY_BASE + 2, *COMMUNICATION), heard(EMCY_BASE + 2, *TEMPERATURE), "node 2: EMCY 4210h"),
     ],
 )
 def test_a_limit_itself_is_kept_and_what_is_beyond_is_named(key, within, beyond, told):
     assert check(key)(within) is None
     assert told in str(check(key)(beyond))
-
-
-def test_a_hold_that_took_too_long_is_a_retreat_and_no_longer_a_hold():
-    assert check("error_passive")(seen(passive_ns=1_000_000_001, **PASSIVE)) is None
-
-
-def test_what_is_counted():
-    """Each number of the cell, by the condition that counts it; without drives and array there are none of theirs."""
-    found = heard(EMCY_BASE + 1, *COMMUNICATION)
-    found.silent_taxels, found.slowed, found.restarts = 2, 3, 4
-    found.counters.error_frames, found.counters.overruns, found.counters.clock_steps = 5, 6, 7
-    expected = {"emcy_communication": 1, "silent_taxels": 2, "target_speed": 3, "estimator": 4}
-    expected |= {"error_frames": 5, "frames_dropped": 6, "clock_step": 7}
-    assert {key: n for key, count in COUNTERS if (n := count(found))} == expected
-    found.drives, found.tactile = SimpleNamespace(missed=8, implausible=100), SimpleNamespace(unusable=9, stale=10)
-    expected |= {"pdo_missed": 108, "torn_frame": 9, "sync_mismatch": 10}
-    assert {key: count(found) for key, count in COUNTERS} == expected
 
 
 def test_what_ends_the_enabling_of_the_drives_already():
@@ -211,20 +173,6 @@ def test_the_documented_table_is_the_one_that_supervises():
 PERIOD_NS = 5_000_000
 
 
-def test_only_an_unbroken_run_of_saturated_samples_counts():
-    contact = TouchState(LIMITS)
-    told = []
-    for k, saturated in enumerate((True, True, True, False, True, True)):
-        contact.update_force(felt(force=2.0, saturated=saturated, off_pad=False, bridged=0.0), k * PERIOD_NS)
-        told.append(contact.hidden_s)
-    assert told == pytest.approx([0.0, 0.005, 0.01, 0.0, 0.0, 0.005])
-
-
-def findings(saturated):
-    patches = [felt(force=2.0, saturated=one, off_pad=False, bridged=0.0) for one in saturated]
-    return guarded(patches)
-
-
 def guarded(patches):
     supervisor, found = Supervisor(seen(), None), []
     for k, patch in enumerate(patches):
@@ -234,27 +182,30 @@ def guarded(patches):
     return found
 
 
-def test_an_own_controller_is_guarded_against_it():
-    found = findings([False, True, True, True, True, True, True])
-    assert found[:6] == [None] * 6
-    assert found[6].condition.key == "force_hidden"
-    assert found[6].condition.reaction is Reaction.RETREAT
-    assert "above the 2.0 N measured" in str(found[6].error)
+def shown(force, *, saturated=False, off_pad=False):
+    """What an image shows."""
+    return felt(force=force, saturated=saturated, off_pad=off_pad, bridged=0.0)
 
 
-def test_a_touch_that_saturates_now_and_then_goes_on():
-    assert findings([True, True, True, True, False] * 6) == [None] * 30
+@pytest.mark.parametrize(
+    ("patches", "key"),
+    [
+        ([shown(2.0), *[shown(2.0, saturated=True)] * 6], "force_hidden"),
+        ([*[shown(2.0)] * 2, *[shown(2.0, off_pad=True)] * 6], "off_pad"),
+    ],
+)
+def test_an_own_controller_is_guarded_against_a_force_that_shows_in_part(patches, key):
+    *before, last = guarded(patches)
+    assert before == [None] * len(before)
+    assert (last.condition.key, last.condition.reaction) == (key, Reaction.RETREAT)
+    assert "the true force is above the 2.0 N measured" in str(last.error)
 
 
-def test_nor_may_its_contact_run_off_the_array():
-    running_off = [felt(force=1.0, saturated=False, off_pad=k > 1, bridged=0.0) for k in range(8)]
-    found = guarded(running_off)
-    assert found[:7] == [None] * 7
-    assert found[7].condition.key == "off_pad" and found[7].condition.reaction is Reaction.RETREAT
-    assert "the true force is above the 1.0 N measured" in str(found[7].error)
-    assert guarded([felt(force=0.05, saturated=False, off_pad=True, bridged=0.0)] * 20) == [None] * 20, (
-        "no contact at all"
-    )
+@pytest.mark.parametrize(
+    "patches", [[*[shown(2.0, saturated=True)] * 4, shown(2.0)] * 6, [shown(0.05, off_pad=True)] * 20]
+)
+def test_a_touch_that_saturates_now_and_then_goes_on_and_so_does_one_without_contact(patches):
+    assert guarded(patches) == [None] * len(patches)
 
 
 def test_a_press_between_two_retreats_is_not_forgotten():

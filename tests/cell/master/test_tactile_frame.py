@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from canprobe.cell.master.tactile_frame import decode
-from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileMessage, TactileMode
+from canprobe.fieldbus.protocol.tactile import TactileHeader, TactileMessage, TactileMode
 
 
 @pytest.mark.parametrize("shape", [(16, 16), (12, 9)])
@@ -15,9 +15,7 @@ def test_the_taxels_of_a_window_lie_where_they_were(shape, side):
     header = TactileHeader(4, 2, row, col, TactileMode.WINDOW, True, 5000, window=side)
     frame = decode(TactileMessage(header, pad[row:, col : col + side].tobytes(), 1000), shape)
     expected = np.zeros(shape, np.uint8)
-    for r in range(row, row + side):
-        for c in range(col, col + side):
-            expected[r, c] = pad[r, c]
+    expected[row:, col : col + side] = pad[row:, col : col + side]
     assert np.array_equal(frame.taxels, expected) and frame.taxels.dtype == np.uint8
     assert frame.window == (row, col, side, side) and frame.features is None
     assert (frame.header, frame.t_ns) == (header, 1000)
@@ -31,10 +29,3 @@ def test_an_image_fills_the_pad_and_what_fills_up_its_last_word_is_not_read():
         TactileMessage(TactileHeader(0, 0, 0, 0, TactileMode.IMAGE, False, 0), pad.tobytes() + b"\xff", 7), (5, 3)
     )
     assert np.array_equal(frame.taxels, pad) and frame.window == (0, 0, 5, 3)
-
-
-def test_features_cover_no_taxels():
-    sent = Features(2.0, 7.5, 8.25, 2.5, -0.75, 3.25, peak=0xC8)
-    header = TactileHeader(7, 2, 0xC, 8, TactileMode.FEATURES, False, 0)
-    frame = decode(TactileMessage(header, sent.pack(), 0), (16, 16))
-    assert frame.features == sent and frame.window == (0, 0, 0, 0) and not frame.taxels.any()

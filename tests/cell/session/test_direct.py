@@ -1,25 +1,23 @@
 """A run without a bus: to the last bit that of a lockstep bus whose frames take no time, and what it leaves out."""
 
 from dataclasses import replace
-from itertools import count
 
 import pytest
 
 import canprobe
 from canprobe.cell.master.controller import Command
-from canprobe.cell.scene.load import packaged
 from canprobe.cell.session.session import Session
 from canprobe.cell.session.up import up
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import NodeError, PlanError, UsageError
 
 
-def on_both(scene, controller=make_task):
-    """The closed session without a bus, and on an untimed lockstep bus."""
+def on_both(scene):
+    """The closed session of the scene's task without a bus, and on an untimed lockstep bus."""
     for bus in (replace(scene.bus, interface="direct"), replace(scene.bus, timed=False)):
         session = Session(replace(scene, bus=bus))
         with session:
-            session.run(controller(session.plan))
+            session.run(make_task(session.plan))
         yield session
 
 
@@ -43,42 +41,18 @@ def assert_same(direct, lockstep):
 @pytest.mark.parametrize(
     "scene",
     [
-        pytest.param(loaded("cylinder", task={"clearance_mm": 0.2}, shape={"also": ()}), id="cylinder"),
         pytest.param(
             loaded("press", task={"clearance_mm": 0.2}, arm={"grouped_rpdo": True}, sensor={"mode": "features"}),
             id="press",
         ),
         pytest.param(loaded("listen", sensor={"mode": "image", "rate_hz": 100.0}), id="listen"),
         pytest.param(loaded("free", "prbt"), id="free of another make"),
-        pytest.param(loaded("turntable", task={"clearance_mm": 0.2}, shape={"also": ()}), id="turntable"),
+        pytest.param(loaded("press", "external", task={"clearance_mm": 0.2}), id="an external arm"),
+        pytest.param(loaded("turntable", task={"clearance_mm": 0.2}, shape={"also": ()}), id="a scan on a turntable"),
     ],
 )
 def test_log_and_truth_are_those_of_an_untimed_lockstep_bus_to_the_last_bit(scene):
     assert_same(*on_both(scene))
-
-
-def the_beginning(plan):
-    """The scene's own task, cut off after a tenth of a second."""
-    task, steps = make_task(plan), count(1)
-
-    def step(measurement):
-        command = task.step(measurement)
-        task.update()
-        return replace(command, done=command.done or next(steps) == 40)
-
-    return step
-
-
-FEW = ("free", "listen")
-OTHERS = pytest.mark.slow(reason="each packaged scene, on two buses")
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[OTHERS] * (name not in FEW)) for name, _ in packaged("scene")]
-)
-def test_every_packaged_scene_begins_as_on_an_untimed_lockstep_bus(name):
-    direct, lockstep = on_both(loaded(name), the_beginning)
-    assert_same(direct, lockstep)
 
 
 def test_a_drive_that_fails_stops_the_cell_with_the_words_of_a_bus():

@@ -125,7 +125,6 @@ def test_stored_values_are_there_again_each_with_its_node(served, tmp_path):
         ("239.74.163.2", True, ("free", "--nodes", "1")),
         ("ff15::1", True, ("--eds", "puma260_joint", "--node-id", "1")),
         (LOCAL_GROUP, False, ("free", "--nodes", "1")),
-        ("ff01::2", False, ("--eds", "puma260_joint", "--node-id", "1")),
     ],
 )
 def test_nodes_that_other_machines_reach_are_served_with_the_warning_of_a_run(served, capsys, what, channel, wide):
