@@ -99,10 +99,3 @@ def test_a_wall_clock_that_is_set_in_each_phase_changes_nothing(run_with):
     assert stepped.keys() == log.keys()
     for column, values in log.items():
         np.testing.assert_array_equal(stepped[column], values, err_msg=column)
-    to_and_fro = []
-    for number, t_ns in enumerate(sorted(times.values())):  # frames of one look, between two others
-        step = (-1) ** number * HOUR_NS
-        to_and_fro += [(t_ns, step), (t_ns + 400_000, -step)]
-    stepped, found, _ = run_with("to and fro", to_and_fro)
-    assert found["completed"] and found["cycle"]["clock_steps"] > 0
-    np.testing.assert_array_equal(stepped["force_n"], log["force_n"])
