@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import canprobe
+from canprobe.cell.master.monitor import Monitor
+from canprobe.cell.master.options import RunOptions
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.session.session import Session
@@ -45,14 +47,18 @@ def test_a_harder_layer_is_said_once_and_widens_the_force_alone():
 
 def test_images_that_contradict_the_motion_are_left_out_and_regions_are_wider():
     """A scan of a cylinder of 36 mm with an array that blurs more than its calibration says."""
-    plan = canprobe.plan("cylinder", SCAN)
-    session, task = Session(plan), make_task(plan)
+    plan, frames = canprobe.plan("cylinder", SCAN | {"bus.interface": "lockstep"}), []
+    watch = RunOptions(observers=(lambda observation: frames.extend(observation.frames),))
+    session, task = Session(plan, watch), make_task(plan)
     session.buses.world.plant.array = TaxelArray(TaxelConfig(blur_pitch=1.0), np.random.default_rng(3), pad=Pad())
     with session:
         session.run(task)
     (line,) = said(session.cell.notes.lines())
     assert re.search(r"blurred by 1\.[5-8]. mm", line)
     assert ": forces and regions are stated wider from here on" in line
+    monitor = Monitor(plan)
+    monitor.push(frames)
+    assert monitor.view(frames[-1][2]).array.startswith(f"{SAID}: its images are blurred by")
     answers = [record.estimate for record in task.shape.records]
     withheld, last = [answer.rank for answer in answers[20:60]], answers[-1]
     assert max(withheld) == 0 and last.rank == 3 and "patch" not in last.method
