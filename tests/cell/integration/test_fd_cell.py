@@ -7,10 +7,8 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.errors import BusError, PlanError
+from canprobe.errors import PlanError
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.bus.clock import VirtualClock
-from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 
 PERIOD_NS = 2_500_000
 
@@ -59,10 +57,3 @@ def test_a_device_without_long_pdos_keeps_short_ones_and_the_plan_says_so():
     plan = canprobe.plan(dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, eds="tactile_array.eds")))
     assert {pdo.layout.length for pdo in plan.pdos_of(16, "tpdo")} == {8}
     assert any(what == "CAN FD frames from the sensor" for what, _ in plan.not_available)
-
-
-def test_a_classical_lockstep_bus_carries_no_long_frame():
-    for fd, length, complaint in ((False, 12, "CAN has 8"), (True, 13, "CAN FD has 12, 16, 20, 24, 32, 48, 64")):
-        port = LockstepBus(VirtualClock(), "can0", fd=fd).port()
-        with pytest.raises(BusError, match=complaint):
-            port.send_batch([(0x512, bytes(length))])

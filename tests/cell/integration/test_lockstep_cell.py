@@ -95,22 +95,6 @@ def test_a_node_of_another_make_is_named():
         pass
 
 
-def test_own_controller_in_ten_lines():
-    with canprobe.open_cell(canprobe.load_scene("free")) as cell:
-        q0 = None
-
-        def nod(measurement):
-            nonlocal q0
-            q0 = measurement.q if q0 is None else q0
-            target = q0.copy()
-            target[5] += 0.1 * np.sin(measurement.cycle / 30)
-            return Command(q_target=target, done=measurement.cycle > 180)
-
-        cell.run(nod)
-    assert np.ptp(cell.session.buses.truth["q_rad"][:, 5]) == pytest.approx(0.2, abs=0.01)
-    assert np.ptp(cell.session.buses.truth["q_rad"][:, 0]) < 1e-3
-
-
 def test_what_is_no_controller_is_told_before_a_drive_is_enabled():
     session = session_of("free")
     with pytest.raises(UsageError, match=r"measurement or a canprobe\.Controller, got 3"), session:
