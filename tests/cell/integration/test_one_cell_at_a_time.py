@@ -45,7 +45,9 @@ def nod(measurement):
 
 
 def test_a_controller_of_ones_own_leaves_what_a_run_leaves(free, tmp_path):
-    with canprobe.open_cell(undrawn(free), out=tmp_path / "own") as cell:
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "surface.npz").write_text("of an earlier run")
+    with canprobe.open_cell(undrawn(free), out=tmp_path / "own", force=True) as cell:
         result = cell.run(nod)
         with pytest.raises(UsageError, match=r"result\.summary: complete when the block of open_cell is left"):
             _ = result.summary["completed"]
@@ -71,9 +73,7 @@ def test_several_controllers_in_one_block_are_one_run(free, tmp_path):
         cell.run(nod)
 
 
-@pytest.mark.parametrize(
-    ("error", "reason"), [(ValueError("oh"), "ValueError: oh"), (SafetyStop("oh"), "oh"), (None, "oh")]
-)
+@pytest.mark.parametrize(("error", "reason"), [(ValueError("oh"), "ValueError: oh"), (None, "oh")])
 def test_a_block_that_is_left_by_an_error_leaves_its_files_too(free, tmp_path, error, reason):
     def fail(measurement):
         if measurement.cycle > 100 and error is not None:
@@ -100,18 +100,13 @@ def test_a_cell_is_opened_once_and_used_while_it_is_open(free):
 
 
 def test_results_replace_others_only_where_that_is_wanted(free, tmp_path, capsys):
-    scene, run = undrawn(free), ["run", "free", "--no-figures", "--duration", "0.1", "--out", str(tmp_path)]
+    run = ["run", "free", "--no-figures", "--duration", "0.1", "--out", str(tmp_path)]
     undrawn_run(free, out=tmp_path, duration_s=0.1)
     (tmp_path / "surface.npz").write_text("of an earlier run")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    for call in (canprobe.run, canprobe.open_cell):
-        with pytest.raises(UsageError, match="not empty: name another folder for the results"):
-            call(scene, out=tmp_path)
-    for words in (
-        run,
-        [*run, "--bus", "socketcan", "--channel", "nobus0"],
-        ["view", "free", *run[3:], "--html", "x.html"],
-    ):
+    with pytest.raises(UsageError, match="not empty: name another folder for the results"):
+        canprobe.open_cell(free, out=tmp_path)
+    for words in (run, ["view", "free", *run[3:], "--html", "x.html"]):
         assert main(words) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"canprobe: {tmp_path}: not empty") and "--force" in line
@@ -119,9 +114,6 @@ def test_results_replace_others_only_where_that_is_wanted(free, tmp_path, capsys
     assert main([*run, "--force", "--seed", "1"]) == 0
     assert not (tmp_path / "surface.npz").exists()
     assert json.loads((tmp_path / "summary.json").read_text())["seed"] == 1
-    with canprobe.open_cell(scene, out=tmp_path, force=True) as cell:
-        result = cell.run(nod)
-    assert result.summary["seed"] == 0
 
 
 def test_a_run_that_does_not_begin_replaces_nothing(free, tmp_path):
