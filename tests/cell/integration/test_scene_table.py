@@ -1,12 +1,8 @@
 """Each packaged object and stiffness, some seconds of scan in lockstep, scored against the plant's truth."""
 
-from dataclasses import replace
-
 import pytest
 
 import canprobe
-from canprobe.cell.scene.model import ObjectSettings
-from canprobe.errors import PlanError
 
 # scene: force RMS error and curvature RMS error that it stays below, percent
 TABLE = {
@@ -40,11 +36,3 @@ def test_scene_runs_completely_with_sensible_figures(name):
     if name == "miscalibrated":  # what real calibration costs: the default has 1 % and 0.1 mm
         assert shape["kappa_rms_error_percent"] > 4.0
         assert shape["position_rms_mm"] > 0.5
-
-
-def test_a_bowl_as_tight_as_the_probe_is_refused_with_the_reason():
-    scene = canprobe.load_scene("bowl")
-    assert scene.object.kind == "bowl"
-    tight = replace(scene, object=ObjectSettings("bowl", radius_mm=40.0))
-    with pytest.raises(PlanError, match="hollow of radius 40 mm is tighter than the probe"):
-        canprobe.plan(tight)
