@@ -109,11 +109,16 @@ def test_a_bus_with_errors_carries_every_frame_and_the_run_says_so(tmp_path):
     assert noted is not None and 0 < int(noted[1]) <= bus.error_frames  # those of bring-up are none of a cycle's
 
 
-def test_error_frames_of_a_real_bus_are_in_the_log_and_beside_the_plan(monkeypatch, tmp_path):
-    """can0 as a cell opens a real one, in virtual time: two errors and a lost arbitration, in the first cycle."""
+ERRORS = 0x20000002, 0x200000A8, 0x20000088
+"""A lost arbitration, which is no error, and two errors."""
+
+
+@pytest.fixture
+def run_on_real_bus(monkeypatch):
+    """A run of `free` on can0 as a cell opens a real one, in virtual time, with errors in the first cycle."""
     keys = {"arm.emulated": False, "task.duration_s": 0.1, "outputs.figures": False, "bus.interface": "socketcan"}
     scene = canprobe.load_scene("free", keys)
-    bus, reports, errors = LockstepBus(VirtualClock()), [], (0x20000002, 0x200000A8, 0x20000088)
+    bus, reports = LockstepBus(VirtualClock()), []
     for node in make_world(canprobe.plan(scene), scene.drives).nodes:
         bus.attach(node)
 
@@ -127,16 +132,29 @@ def test_error_frames_of_a_real_bus_are_in_the_log_and_beside_the_plan(monkeypat
     monkeypatch.setattr("canprobe.cell.session.session.garbage_collection_paused", lambda **_: nullcontext())
     monkeypatch.setattr("canprobe.cell.session.session.rehearse", lambda _: None)
 
-    def progress(done_s, _):
-        while reports:
-            report = reports.pop()
-            for can_id in errors:
-                report.error_frame(can_id, bytes(8), round(done_s * 1e9))
+    def run(errors, **options):
+        left = list(errors)
 
-    result = canprobe.run(scene, out=tmp_path, progress=progress)
+        def progress(done_s, _):
+            while left:
+                reports[0].error_frame(left.pop(0), bytes(8), round(done_s * 1e9))
+
+        return canprobe.run(scene, progress=progress, **options)
+
+    return run
+
+
+def test_error_frames_of_a_real_bus_are_in_the_log_and_beside_the_plan(run_on_real_bus, tmp_path):
+    result = run_on_real_bus(ERRORS, out=tmp_path)
     traffic = result.summary["traffic"]["can0"]
     assert (traffic["error_frames"], traffic["as_planned"]) == (2, False)
     assert all(one["as_planned"] for one in traffic["classes"].values())
     logged = [line.split()[2] for line in (tmp_path / "bus.log").read_text().splitlines() if " 2000" in line]
-    assert logged == [f"{can_id:08X}#{'00' * 8}" for can_id in errors]
+    assert logged == [f"{can_id:08X}#{'00' * 8}" for can_id in ERRORS]
     assert read_recording(tmp_path / "bus.log", result.plan).error_frames == 2
+
+
+@pytest.mark.parametrize(("errors", "found"), [(ERRORS, (False, 2)), ((), (None, 0))])
+def test_without_a_log_the_errors_of_a_real_bus_are_counted_all_the_same(run_on_real_bus, errors, found):
+    traffic = run_on_real_bus(errors, files=False).summary["traffic"]
+    assert traffic == {"can0": dict(zip(("as_planned", "error_frames"), found, strict=True))}

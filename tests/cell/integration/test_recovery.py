@@ -12,6 +12,7 @@ from recovering import HELD_CYCLES, LOSS_CYCLE, Enabled, Returning, Way
 import canprobe
 from canprobe.cell.master.conditions import BY_KEY
 from canprobe.cell.master.controller import Command, Controller
+from canprobe.cell.master.monitor import Monitor
 from canprobe.cell.npz import read_npz
 from canprobe.cell.session.recovery import PASSING
 from canprobe.cell.session.session import Session
@@ -45,6 +46,12 @@ def test_a_drive_without_power_comes_back_and_nothing_is_lost_from_the_logs(tmp_
     told = [float(line[:12]) for line in steps]
     assert told == sorted(told) and told[-1] > 2.5
 
+    monitor = Monitor(run.opened.plan)
+    monitor.push((can_id, data, t_ns) for t_ns, _, can_id, data in frames)
+    events = [line.split("s   ")[1] for line in monitor.view(frames[-1][0]).events]
+    seen = [events.index(step) for step in ("node 3: booted", "nodes 1-6: NMT command reset node")]
+    assert seen == sorted(seen)
+    assert any("no longer enabled" in event for event in events[seen[-1] :]), "it is stopped as the first one is"
     kinds = "\n".join(run.summary["faults"])
     words = ("node 3: lost: no usable TPDO .*", "the cell came back", "motion was asked for, and went on")
     lost_s, back_s, went_on_s = (float(re.search(rf"{one}, at ([\d.]+) s", kinds)[1]) for one in words)
