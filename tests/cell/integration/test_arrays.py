@@ -180,6 +180,12 @@ def test_an_array_of_another_size_scans():
     assert summary["shape"]["kappa_est_per_m"][0] == pytest.approx(1 / 0.036, abs=3.0)
 
 
+def test_a_node_of_another_size_computes_features():
+    scene = touch('rows = 10\ncolumns = 12\npitch_mm = 2\nmode = "features"', "press")
+    summary = canprobe.run(scene, bus="direct", files=False).summary
+    assert summary["completed"] and summary["contact"]["force_rms_error_n"] < 0.3
+
+
 def test_a_node_that_has_fewer_taxels_than_the_file_is_refused(tmp_path):
     """The packaged EDS with 8 image objects: that of an 8×8 array."""
     text = (resources.files("canprobe.fieldbus.eds") / "tactile_array.eds").read_text()
