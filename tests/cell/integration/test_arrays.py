@@ -6,16 +6,16 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from undrawn import undrawn_run
 
 import canprobe
-from canprobe.cell.planning.make import make_plan
-from canprobe.cell.planning.measured import TrafficMeter
 from canprobe.cell.planning.report import plan_text
 from canprobe.cell.scene.load import parse_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.errors import PlanError, SafetyStop, SceneError, UsageError
+from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.protocol.raw_image import ImageAssembler
 
 LISTEN = """
@@ -61,7 +61,8 @@ ids = ["510h-51Eh"]
 frames = ["ss tt uu vv ww xx yy zz"]
 latency_ms = 4
 latency_sigma_ms = 0.5"""
-RAW = ("uskin4x4", "uskin4x6", "linker12x6", "icub-triangles", "poweron6x6")
+RAW = ("uskin4x4", "linker12x6", "icub-triangles")
+"""Arrays that run on their own time, that are polled, and whose counts fall."""
 
 
 def listen(array, sensor="", duration=1.0):
@@ -72,24 +73,16 @@ def touch(sensor, kind="scan"):
     return parse_scene(TOUCH.format(sensor=sensor, kind=kind))
 
 
-def plan_of(scene):
-    return make_plan(resolve(scene))
-
-
-def frames_of(path):
-    for line in path.read_text().splitlines():
-        stamp, _, frame = line.split()
-        can_id, _, data = frame.partition("#")
-        yield round(float(stamp.strip("()")) * 1e9), int(can_id, 16), bytes.fromhex(data)
-
-
 @pytest.mark.parametrize("array", RAW)
 def test_an_array_of_raw_frames_is_started_listened_to_and_recorded(array, tmp_path):
     scene = listen(array, duration=3.0 if array == "uskin4x4" else 1.0)
-    plan, result = plan_of(scene), canprobe.run(scene, out=tmp_path / "run")
+    plan, result = canprobe.plan(scene), canprobe.run(scene, out=tmp_path / "run")
     summary, raw = result.summary, plan.setup.array.raw
     assert summary["completed"] and summary["cycle"]["torn_frames"] == 0
-    sent = list(frames_of(tmp_path / "run" / "bus.log"))
+    assert summary["bus_load"]["can0"]["measured"] < plan.traffic.load
+    measured = canprobe.measure_traffic(tmp_path / "run", plan)
+    assert measured.as_planned, measured.text()
+    sent = [(t_ns, can_id, data) for t_ns, _, can_id, data in read_candump(tmp_path / "run" / "bus.log")]
     assert {can_id for _, can_id, _ in sent} <= {frames.can_id for frames in plan.raw} | {0x080, 0x77F, 0x000}
     commands = [(can_id, data) for _, can_id, data in sent]
     assert all(frame in commands for frame in (*raw.start, *raw.stop))
@@ -130,59 +123,38 @@ def test_the_latency_of_a_calibration_counts_where_it_is_sure(sigma_ms, applied,
     assert found["t_sigma_s"] == pytest.approx(np.hypot(0.5e-3, 1e-3 * sigma_ms) if applied else 0.5e-3)
 
 
-def test_traffic_of_raw_frames_is_as_planned(tmp_path):
-    scene = listen("linker12x6")
-    result = canprobe.run(scene, out=tmp_path / "run")
-    assert result.summary["bus_load"]["can0"]["measured"] < plan_of(scene).traffic.load
-    meter = TrafficMeter(plan_of(scene))
-    for t_ns, can_id, data in frames_of(tmp_path / "run" / "bus.log"):
-        meter.write(can_id, data, t_ns)
-    measured = meter.report()
-    assert measured.as_planned, measured.text()
-
-
 def test_the_plan_sees_the_identifiers_of_raw_frames():
     with pytest.raises(PlanError, match=r'201h is RPDO1 of node 1 on can0; .*sensor.channel = "can1"'):
-        plan_of(touch('array = "uskin4x4"', "press"))
+        canprobe.plan(touch('array = "uskin4x4"', "press"))
     own = touch('array = "uskin4x4"\nchannel = "can1"', "press")
-    assert {frames.channel for frames in plan_of(own).raw} == {"can1"}
+    assert {frames.channel for frames in canprobe.plan(own).raw} == {"can1"}
     moved = {name: replace(joint, node_id=16 + i) for i, (name, joint) in enumerate(own.joints.items())}
     with pytest.raises(PlanError, match=r"710h is the heartbeat of node 16 on another bus, .*take other node ids"):
-        plan_of(replace(own, joints=moved))
+        canprobe.plan(replace(own, joints=moved))
 
 
-def test_a_flat_array_is_pressed_and_holds_the_force(tmp_path):
-    cell = 'array = "uskin4x4"\nchannel = "can1"'
-    scene = parse_scene(TOUCH.format(sensor=cell, kind="press").replace('"cylinder"', '"sphere"'))
-    summary = canprobe.run(scene, out=tmp_path / "run").summary
-    assert summary["completed"] and summary["contact"]["force_rms_error_n"] < 0.5
-    # the start frame has the identifier of an RPDO on the other bus: each goes where it belongs
-    lines = (tmp_path / "run" / "bus.log").read_text().splitlines()
-    assert [line.split()[1] for line in lines if line.endswith(" 201#0700")] == ["can1"]
-    assert {line.split()[1] for line in lines if " 201#" in line and "#070" not in line} == {"can0"}
+BALL = {"sensor.channel": "can1", "object.kind": "sphere"}
+SLOW = {"sensor.array": "linker12x6", "cycle.rate_hz": 125, "sensor.rate_hz": 125 / 3}
 
 
 @pytest.mark.parametrize(
-    ("array", "radius_mm", "seed", "pace"),
-    [
-        ("uskin4x4", 60, 2, {}),
-        ("uskin4x4", 15, 1, {}),
-        ("linker12x6", 15, 1, {"cycle.rate_hz": 125, "sensor.rate_hz": 125 / 3}),
-    ],
+    "keys", [{"sensor.array": "uskin4x4", "object.radius_mm": 60}, SLOW | {"object.radius_mm": 15}], ids=["60", "15"]
 )
-def test_a_flat_array_reaches_its_force_on_any_ball_that_fits_on_it(array, radius_mm, seed, pace):
+def test_a_flat_array_reaches_its_force_on_any_ball_that_fits_on_it(keys, tmp_path):
     """It was taken for a sphere of 10 m: no depth that it goes to is too deep for that, and it pressed 0.4 to 1.5 N."""
-    touch = {"sensor.array": array, "sensor.channel": "can1", "object.kind": "sphere", "object.radius_mm": radius_mm}
-    summary = canprobe.run("press", touch | pace | {"task.duration_s": 1.0}, seed=seed, files=False).summary
-    assert summary["completed"] and summary["contact"]["force_rms_error_n"] < 0.3
+    result = undrawn_run(canprobe.load_scene("press", BALL | keys | {"task.duration_s": 1.0}), out=tmp_path)
+    assert result.summary["completed"] and result.summary["contact"]["force_rms_error_n"] < 0.3
+    # a start frame has the identifier of an RPDO on the other bus: each goes where it belongs
+    raw, frames = result.plan.setup.array.raw, list(read_candump(tmp_path / "bus.log"))
+    assert {channel for _, channel, can_id, data in frames if (can_id, data) in raw.start} <= {"can1"}
+    assert {channel for _, channel, can_id, data in frames if can_id == 0x201 and len(data) == 6} == {"can0"}
 
 
 def test_a_ball_that_is_too_blunt_for_a_flat_array_is_told():
-    touch = {"sensor.array": "linker12x6", "sensor.channel": "can1", "object.kind": "sphere", "object.radius_mm": 60}
-    touch |= {"cycle.rate_hz": 125, "sensor.rate_hz": 125 / 3}
-    assert "at 2 N fits on what is rounder than a ball of 20 mm" in plan_text(canprobe.plan("press", touch))
+    keys = BALL | SLOW | {"object.radius_mm": 60}
+    assert "at 2 N fits on what is rounder than a ball of 20 mm" in plan_text(canprobe.plan("press", keys))
     with pytest.raises(SafetyStop, match="runs off the edge of the array"):
-        canprobe.run("press", touch, files=False)
+        canprobe.run("press", keys, files=False)
 
 
 @pytest.mark.parametrize("kind", ["scan", "calibrate"])
@@ -192,16 +164,16 @@ def test_a_flat_array_is_no_probe(kind):
     if kind == "calibrate":
         scene = scene.replace('kind = "cylinder"\nradius_mm = 36', 'kind = "sphere"\nradius_mm = 25')
     with pytest.raises(PlanError) as caught:
-        plan_of(parse_scene(scene))
+        canprobe.plan(parse_scene(scene))
     assert len(caught.value.problems) == 1 and "uskin4x4 is flat" in caught.value.problems[0]
 
 
 def test_an_array_of_another_size_scans():
-    few = plan_of(touch("rows = 8\ncolumns = 8\npitch_mm = 3"))
+    few = canprobe.plan(touch("rows = 8\ncolumns = 8\npitch_mm = 3"))
     assert not few.setup.shape.patch
     assert "no curvature: fewer than 16 taxels" in dict(few.left_out)["curvature from the patch"]
     scene = touch(FREE)
-    assert plan_of(scene).setup.shape.patch
+    assert canprobe.plan(scene).setup.shape.patch
     result = canprobe.run(scene, {"shape.also": [], "cycle.rate_hz": 200.0}, files=False, duration_s=1.6)
     summary = result.summary  # a coarse array needs more path than 20 mm
     assert summary["completed"] and summary["contact"]["force_rms_error_n"] < 0.3
@@ -215,31 +187,26 @@ def test_a_node_of_another_size_computes_features():
 
 
 def test_a_node_that_has_fewer_taxels_than_the_file_is_refused(tmp_path):
-    eds = _small_eds(tmp_path)
-    with pytest.raises(PlanError, match=r"8 objects of 8 taxels \(2100h\), and the 16 × 16 taxels .* need 32"):
-        plan_of(touch(f'eds = "{eds}"'))
-    plan_of(touch(f'eds = "{eds}"\nrows = 8\ncolumns = 8\npitch_mm = 3'))
-
-
-def _small_eds(folder):
     """The packaged EDS with 8 image objects: that of an 8×8 array."""
     text = (resources.files("canprobe.fieldbus.eds") / "tactile_array.eds").read_text()
     head, rest = text.split("[2100sub0]")
-    path = folder / "small.eds"
-    path.write_text(f"{head}[2100sub0]{rest.replace('DefaultValue=32', 'DefaultValue=8', 1)}")
-    return path
+    eds = tmp_path / "small.eds"
+    eds.write_text(f"{head}[2100sub0]{rest.replace('DefaultValue=32', 'DefaultValue=8', 1)}")
+    with pytest.raises(PlanError, match=r"8 objects of 8 taxels \(2100h\), and the 16 × 16 taxels .* need 32"):
+        canprobe.plan(touch(f'eds = "{eds}"'))
+    canprobe.plan(touch(f'eds = "{eds}"\nrows = 8\ncolumns = 8\npitch_mm = 3'))
 
 
 def test_the_speed_of_a_scan_is_limited_by_the_image_rate():
     slow = "rows = 8\ncolumns = 8\npitch_mm = 3\nrate_hz = 5"
     with pytest.raises(PlanError, match=r"5 mm from one image to the next .* lower task.speed_mm_s to 15"):
-        plan_of(touch(slow))
+        canprobe.plan(touch(slow))
 
 
 def test_only_a_free_running_array_has_any_rate():
-    assert plan_of(listen("uskin4x4", "rate_hz = 90")).raw[0].rate_hz == 90
+    assert canprobe.plan(listen("uskin4x4", "rate_hz = 90")).raw[0].rate_hz == 90
     with pytest.raises(PlanError, match=r"an image every 5\.714 cycles cannot be asked for; take 66\.6667 or 80 Hz"):
-        plan_of(listen("linker12x6", "rate_hz = 70"))
+        canprobe.plan(listen("linker12x6", "rate_hz = 70"))
 
 
 def test_an_array_may_come_on_its_own_sphere(tmp_path):
@@ -249,72 +216,46 @@ def test_an_array_may_come_on_its_own_sphere(tmp_path):
     assert (setup.array.pad.mount_radius_m, setup.probe.radius) == (0.02, 0.02)
 
 
-HEXAGONAL = [
-    [round((column - 7.5) * 1.55 + (0.4 if row % 2 else -0.4), 3), round((row - 7.5) * 1.6, 3), 0]
-    for row in range(16)
-    for column in range(16)
-]
-SCANNING = {
-    "two pitches": 'rows = 14\ncolumns = 16\npitch_mm = [1.4, 1.9]\nmode = "image"\nrate_hz = 100\nchannel = "can1"',
-    "places": f'pitch_mm = 1.575\npositions_mm = {HEXAGONAL}\nmode = "image"\nrate_hz = 100\nchannel = "can1"',
-    "signed, falling, tared": f"""pitch_mm = 1.575
-positions_mm = {HEXAGONAL}
-mode = "image"
-rate_hz = 80
-channel = "can1"
-[wire]
-kind = "frames"
+def test_a_list_of_places_with_counts_that_are_signed_fall_and_are_tared_scans():
+    places = [
+        [round((column - 7.5) * 1.55 + (0.4 if row % 2 else -0.4), 3), round((row - 7.5) * 1.6, 3), 0]
+        for row in range(16)
+        for column in range(16)
+    ]
+    wire = """kind = "frames"
 ids = ["300h-33Fh"]
 frames = ["aaaa bbbb cccc dddd"]
 byte_order = "little"
 signed = true
 unloaded_counts = -120
 full_scale_counts = -30000
-tare_images = 20""",
-}
-
-
-MORE = pytest.mark.slow(reason="two more arrays; the default scans a list of places in raw frames")
-
-
-@pytest.mark.parametrize("array", [pytest.param(name, marks=[MORE] * ("signed" not in name)) for name in SCANNING])
-def test_an_array_that_is_no_square_grid_scans(array):
-    scene = touch(SCANNING[array])
-    bus = "lockstep" if "wire" in SCANNING[array] else "direct"
-    result = canprobe.run(scene, {"shape.also": []}, bus=bus, duration_s=1.2, files=False)
+tare_images = 20"""
+    sensor = (
+        f'pitch_mm = 1.575\npositions_mm = {places}\nmode = "image"\nrate_hz = 80\nchannel = "can1"\n[wire]\n{wire}'
+    )
+    result = canprobe.run(touch(sensor), {"shape.also": []}, duration_s=1.2, files=False)
     summary = result.summary
     assert summary["completed"] and summary["contact"]["contact_fraction"] == 1.0
     assert abs(summary["contact"]["force_true_bias_n"]) < 0.06, "3 % of 2 N: the model is that of separate taxels"
     assert summary["shape"]["kappa_est_per_m"][0] == pytest.approx(1 / 0.036, rel=0.1), "by the motion alone"
 
 
-def test_a_scan_that_would_leave_a_list_is_refused():
+def test_a_list_has_no_features_and_a_scan_that_would_leave_it_is_refused():
     small = [[x, y, 0] for y in range(-2, 3) for x in range(-2, 3)]
-    sensor = f'rows = 5\ncolumns = 5\npitch_mm = 1\npositions_mm = {small}\nmode = "image"\nrate_hz = 100'
+    sensor = f'rows = 5\ncolumns = 5\npitch_mm = 1\npositions_mm = {small}\nrate_hz = 100\nchannel = "can1"\nmode = '
     with pytest.raises(PlanError, match=r"would run off the array: .* of the array, which reaches 2\.5 mm"):
-        plan_of(touch(sensor + '\nchannel = "can1"'))
-
-
-@pytest.mark.parametrize("mode", ["window", "features"])
-def test_a_list_has_neither_window_nor_features(mode):
-    sensor = SCANNING["places"].replace('mode = "image"', f'mode = "{mode}"')
-    with pytest.raises(PlanError, match=rf'sensor\.mode = "{mode}": .* set sensor\.mode = "image"'):
-        plan_of(touch(sensor, "press"))
+        canprobe.plan(touch(sensor + '"image"'))
+    with pytest.raises(PlanError, match=r'sensor\.mode = "features": .* set sensor\.mode = "image"'):
+        canprobe.plan(touch(sensor + '"features"', "press"))
 
 
 @pytest.mark.parametrize(
     ("sensor", "problem"),
     [
         ("pitch_mm = [1, 2, 3]", "sensor.pitch_mm: expected"),
-        (
-            "rows = 1\ncolumns = 1\npitch_mm = [1, 2]\npositions_mm = [[0, 0, 0]]",
-            "expected one distance with sensor.positions_mm",
-        ),
+        ("rows = 1\ncolumns = 1\npitch_mm = [1, 2]\npositions_mm = [[0, 0, 0]]", "expected one distance with"),
         ('array = "uskin4x4"\n[wire]\nunloaded_counts = -5', "set wire.signed = true for two's complement"),
-        (
-            'array = "uskin4x4"\n[wire]\nsigned = true\nfull_scale_counts = 40000',
-            "expected -32768 to 32767 in 16 signed bits",
-        ),
+        ('array = "uskin4x4"\n[wire]\nsigned = true\nfull_scale_counts = 40000', "-32768 to 32767 in 16 signed bits"),
         ('array = "inch61"', "did you mean inch16?"),
         ("rows = 20", 'sensor.rows: expected at most 16 with wire.kind = "canopen"'),
         ("rows = 6\ncolumns = 6", "sensor.window: expected at most the 6 taxels"),
@@ -333,7 +274,7 @@ def test_contradictions_are_said_with_their_key(sensor, problem):
     assert any(problem in one for one in caught.value.problems), caught.value.problems
 
 
-def test_an_array_that_is_silent_is_named(tmp_path):
+def test_an_array_that_is_silent_is_named():
     scene = listen("icub-triangles", "emulated = true")
     session = Session(scene)
     session.buses.world.raw_array.running = False

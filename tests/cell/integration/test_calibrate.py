@@ -55,12 +55,9 @@ def test_it_presses_gently_and_lets_go_between_the_touches(calibrated):
     assert all(force[a:b].min() == 0.0 for a, b in itertools.pairwise(touches))
 
 
-def test_its_frames_are_those_the_plan_lists(calibrated):
+def test_terminal_and_files_say_it(calibrated):
     measured = canprobe.measure_traffic(calibrated.out, calibrated.plan)
     assert measured.as_planned and measured.unlisted == {} and measured.missing == ()
-
-
-def test_terminal_and_files_say_it(calibrated):
     text = calibrated.text()
     assert "5 touches, condition number" in text
     assert "true 0.400, error" in text
@@ -70,23 +67,15 @@ def test_terminal_and_files_say_it(calibrated):
     assert f"position_sd_mm = {max(calibrated.summary['calibration']['sigma_mm']):.3f}\n" in text
 
 
-@pytest.mark.slow(reason="a scan after the calibration")
-def test_a_scan_with_a_wrong_tool_gets_better_by_it(calibrated):
-    scene = fast(canprobe.load_scene("cylinder"), plant={"tool_error_mm": ERROR_MM}, shape={"also": ()})
+def test_a_scene_with_the_tool_that_was_found_believes_it_and_knows_how_surely(calibrated):
+    """The real tool stays; without a calibration 0.2 mm were believed that nobody measured."""
+    scene = fast(canprobe.load_scene("cylinder"), plant={"tool_error_mm": ERROR_MM})
     better = with_tool(scene, calibrated.out / "tool.toml")
-    real = np.add(scene.plant.tool_error_mm, (0.0, 0.0, 80.0))
     believed = np.array([*better.probe.centre_lateral_mm, better.probe.centre_offset_mm])
-    np.testing.assert_allclose(believed + better.plant.tool_error_mm, real, atol=1e-9)  # the real tool stays
-    runs = [canprobe.run(each, bus="direct", files=False, duration_s=3.0) for each in (scene, better)]
-    wrong, right = (result.summary["shape"] for result in runs)
-    assert right["map"]["sigma_um"] < 0.7 * wrong["map"]["sigma_um"]  # five touches, and 0.2 mm that nobody measured
-    assert right["map"]["within_2_sigma_fraction"] > 0.9
-    assert wrong["map"]["within_2_sigma_relative_fraction"] > 0.9
-    assert wrong["position_rms_mm"] > 0.4
-    assert right["position_rms_mm"] < 0.2
-    assert right["position_rms_mm"] < 0.4 * wrong["position_rms_mm"]
-    # half a millimetre along the pole is 1.4 % of the radius, about what three seconds of scan err by anyway
-    assert max(right["kappa_rms_error_percent"], wrong["kappa_rms_error_percent"]) < 3.0
+    np.testing.assert_allclose(believed + better.plant.tool_error_mm, np.add(ERROR_MM, (0.0, 0.0, 80.0)), atol=1e-9)
+    assert np.linalg.norm(better.plant.tool_error_mm) < 0.4 * np.linalg.norm(ERROR_MM)
+    before, after = (canprobe.plan(each).setup.probe.place_sd for each in (scene, better))
+    assert after < 0.7 * before
 
 
 def test_heights_know_that_the_tool_may_be_off():
@@ -110,7 +99,6 @@ def test_heights_know_that_the_tool_may_be_off():
         ("[probe]\ncentre_offset_mm = -1\ncentre_lateral_mm = [0, 0]\n", "probe.centre_offset_mm: expected"),
         ("[probe]\ncentre_offset_mm = 80\ncentre_lateral_mm = [0, nan]\n", "probe.centre_lateral_mm: expected"),
         ("[probe\n", "not valid TOML"),
-        (f"x = {'9' * 5000}", "not valid TOML"),
     ],
 )
 def test_a_file_that_is_no_calibration_is_refused(tmp_path, text, what):

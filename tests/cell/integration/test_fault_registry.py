@@ -37,6 +37,7 @@ def test_a_kind_trips_the_conditions_that_it_declares(names):
             run.inject(f"node {node_id}: {name} seed=1" + (" for 35 ms" if name in PASSING else ""))
 
     run = Injected(scene, at, throw, until=until, cycle={"rate_hz": rate_hz})
+    run.assert_drives_off()
     assert set(run.session.cell.supervisor.first) == kind.conditions
     begin_ns = run.injected_ns - run.session.record.origin_ns
     end_ns = begin_ns + 300_000_000  # the second after it, in which a lost drive is waited for, is as all others

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.master.monitor import Monitor, lines
+from canprobe.cell.master.monitor import Monitor
 from canprobe.cell.master.options import RunOptions
-from canprobe.cell.planning.make import make_plan
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.cell.scene.load import load_scene
-from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_shape_tracker, make_task
 from canprobe.mechanics.touch.pad import Pad
@@ -27,24 +25,8 @@ SCAN = {
 SAID = "the array is not as its calibration says"
 
 
-def scan(pad=None, **config):
-    """A scan of a cylinder of 36 mm with an array that has the calibration of another one."""
-    plan = make_plan(resolve(load_scene("cylinder", SCAN)))
-    session, task = Session(plan), make_task(plan)
-    session.buses.world.plant.array = TaxelArray(TaxelConfig(**config), np.random.default_rng(3), pad=pad or Pad())
-    with session:
-        session.run(task)
-    return session, task
-
-
 def said(faults):
     return [fault for fault in faults if fault.startswith(SAID)]
-
-
-@pytest.fixture(scope="module")
-def blurred():
-    """A scan with an array that blurs more than its calibration says."""
-    return scan(blur_pitch=1.0)
 
 
 def test_a_harder_layer_is_said_once_and_widens_the_force_alone():
@@ -63,24 +45,24 @@ def test_a_harder_layer_is_said_once_and_widens_the_force_alone():
     assert np.nanmax(steps[len(steps) // 4 :]) < 2.0  # the stiffness is known by then
 
 
-def test_images_that_contradict_the_motion_are_left_out(blurred):
-    session, task = blurred
+def test_images_that_contradict_the_motion_are_left_out_and_regions_are_wider():
+    """A scan of a cylinder of 36 mm with an array that blurs more than its calibration says."""
+    plan, frames = canprobe.plan("cylinder", SCAN | {"bus.interface": "lockstep"}), []
+    watch = RunOptions(observers=(lambda observation: frames.extend(observation.frames),))
+    session, task = Session(plan, watch), make_task(plan)
+    session.buses.world.plant.array = TaxelArray(TaxelConfig(blur_pitch=1.0), np.random.default_rng(3), pad=Pad())
+    with session:
+        session.run(task)
     (line,) = said(session.cell.notes.lines())
     assert re.search(r"blurred by 1\.[5-8]. mm", line)
     assert ": forces and regions are stated wider from here on" in line
+    monitor = Monitor(plan)
+    monitor.push(frames)
+    assert monitor.view(frames[-1][2]).array.startswith(f"{SAID}: its images are blurred by")
     answers = [record.estimate for record in task.shape.records]
     withheld, last = [answer.rank for answer in answers[20:60]], answers[-1]
     assert max(withheld) == 0 and last.rank == 3 and "patch" not in last.method
     assert np.linalg.eigvalsh(last.K) == pytest.approx([0.0, 1e3 / 36.0], abs=1.0)
-
-
-@pytest.mark.slow(reason="one more scan with such an array")
-def test_a_doubted_array_has_wider_regions():
-    """Standard deviations of curvature are twice as large, and the curvature is the same."""
-    plan = make_plan(resolve(load_scene("cylinder", SCAN | {"task.duration_s": 2.0})))
-    task = make_task(plan)
-    with Session(plan) as session:
-        session.run(task)
     sure, doubted = make_shape_tracker(plan.setup), make_shape_tracker(plan.setup)
     doubted.doubted = True
     for tracker in (sure, doubted):
@@ -89,43 +71,3 @@ def test_a_doubted_array_has_wider_regions():
             tracker.answer_at_once(contact.t_s)
     a, b = sure.records[-1].estimate, doubted.records[-1].estimate
     assert b.covariance == pytest.approx(4.0 * a.covariance) and pytest.approx(a.K) == b.K
-
-
-@pytest.mark.slow(reason="a scan of which the default has others, that end without a fault")
-def test_its_own_calibration_is_not_doubted():
-    result = canprobe.run(load_scene("cylinder", SCAN), files=False)
-    assert said(result.summary["faults"]) == []
-
-
-@pytest.mark.slow(reason="three more arrays; the default has one that blurs and one with a harder layer")
-@pytest.mark.parametrize(
-    ("config", "pad", "sign"),
-    [
-        ({"full_scale_pa": 150e3}, Pad(), "its layer has"),  # gains of 2/3
-        ({}, Pad(pitch_m=1.75e-3), "its (images show a layer of|layer has)"),
-        ({}, Pad(pitch_m=1.85e-3), r"its images contradict \d\d % of the answers"),
-    ],
-    ids=["other gains", "other pitch", "an even larger pitch"],
-)
-def test_another_array_is_noticed(config, pad, sign):
-    session, _ = scan(pad, **config)
-    (line,) = said(session.cell.notes.lines())
-    assert re.search(sign, line)
-
-
-@pytest.mark.slow(reason="one more scan with such an array")
-def test_the_monitor_shows_the_blur():
-    plan = make_plan(resolve(load_scene("press", {"task.duration_s": 4.0})))
-    monitor, views = Monitor(plan), []
-
-    def watch(observation):
-        monitor.push(observation.frames)
-        if not views or observation.t_ns > 3_900_000_000:
-            views.append(monitor.view(observation.t_ns).array)
-
-    session, task = Session(plan, RunOptions(observers=(watch,))), make_task(plan)
-    session.buses.world.plant.array = TaxelArray(TaxelConfig(blur_pitch=1.0), np.random.default_rng(3))
-    with session:
-        session.run(task)
-    assert views[0] is None and views[-1].startswith(f"{SAID}: its images are blurred by")
-    assert "array   the array is not as its calibration says" in "\n".join(lines(monitor.view(0)))

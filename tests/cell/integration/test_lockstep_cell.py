@@ -13,9 +13,8 @@ from canprobe.cell.npz import read_npz
 from canprobe.cell.planning.measured import expected_messages
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
-from canprobe.errors import BusError, NodeError, UsageError
+from canprobe.errors import NodeError, UsageError
 from canprobe.fieldbus.bus.candump import read_candump
-from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.fieldbus.protocol.frames import SYNC_ID, NmtState
 
@@ -30,24 +29,12 @@ def session_of(name, duration_s=1.0):
     return Session(canprobe.load_scene(name, {"task.duration_s": duration_s} | (QUICK if name == "press" else {})))
 
 
-def node(session, node_id):
-    return next(n for n in session.buses.world.nodes if n.node_id == node_id)
-
-
-def assert_safe(session, but=()):
-    """Every node is pre-operational and every drive without power; ``but`` were lost."""
+def assert_safe(session):
+    """Every node is pre-operational and every drive without power."""
     for slave in session.buses.world.nodes:
-        if slave.node_id in but:
-            continue
         assert slave.state is NmtState.PRE_OPERATIONAL, slave.name
         if slave.node_id <= 6:
-            assert state_of(statusword_of(slave)) not in POWERED_STATES, slave.name
-
-
-def statusword_of(slave):
-    """6041h as the node answers an SDO upload."""
-    answer = slave.receive(0x600 + slave.node_id, bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0)), slave.core.now_ns)
-    return int.from_bytes(dict(answer)[0x580 + slave.node_id][4:6], "little")
+            assert state_of(slave.dictionary.number(0x6041)) not in POWERED_STATES, slave.name
 
 
 @pytest.mark.parametrize("name", SHORT)
@@ -99,61 +86,6 @@ def test_a_controller_behind_an_error_keeps_the_period_and_the_log_has_every_cyc
     assert len(read_npz(tmp_path / "log.npz")["t_s"]) == len(syncs)
 
 
-def test_the_drives_are_moving_until_quick_stop_brings_them_to_rest():
-    session = session_of("free", 4.0)
-    controller = make_task(session.plan)
-
-    def step(measurement):
-        if measurement.cycle == 160:
-            raise KeyboardInterrupt
-        return controller.step(measurement)
-
-    with pytest.raises(KeyboardInterrupt), session:
-        session.run(step)
-    q = session.buses.truth["q_rad"]
-    assert np.abs(q[155] - q[150]).max() > 1e-4  # it was moving
-    assert np.abs(q[-1] - q[-2]).max() < 5e-5  # a tenth of a count of the coarsest joint, each cycle
-    assert_safe(session)
-
-
-def test_another_master_stops_bring_up():
-    session = session_of("free")
-    session.plan  # noqa: B018
-    original = session.buses.open
-
-    def opened(record):
-        port = original(record)
-
-        class Foreign(Participant):
-            next_deadline_ns = 100_000_000
-
-            def advance(self, t_ns):
-                self.next_deadline_ns = t_ns + 100_000_000
-                return [(0x77F, b"\x05")]
-
-        session.buses.lockstep.attach(Foreign())
-        return port
-
-    session.buses.open = opened
-    with pytest.raises(BusError, match="another master"), session:
-        pass
-
-
-@pytest.mark.parametrize("name", ["free", "press"])
-def test_a_missing_node_is_named(name):
-    session = session_of(name)
-    original = session.buses.open
-
-    def opened(record):
-        port = original(record)
-        session.buses.lockstep.detach(node(session, 4))
-        return port
-
-    session.buses.open = opened
-    with pytest.raises(NodeError, match=r"node 4: \(joint 4\) sent no boot-up"), session:
-        pass
-
-
 def test_a_node_of_another_make_is_named():
     session = session_of("free")
     nodes = list(session.plan.nodes)
@@ -161,22 +93,6 @@ def test_a_node_of_another_make_is_named():
     session.plan = replace(session.plan, nodes=tuple(nodes))
     with pytest.raises(NodeError, match=r"node 5: .*product code expected 0x999, got 0x260"), session:
         pass
-
-
-def test_own_controller_in_ten_lines():
-    with canprobe.open_cell(canprobe.load_scene("free")) as cell:
-        q0 = None
-
-        def nod(measurement):
-            nonlocal q0
-            q0 = measurement.q if q0 is None else q0
-            target = q0.copy()
-            target[5] += 0.1 * np.sin(measurement.cycle / 30)
-            return Command(q_target=target, done=measurement.cycle > 180)
-
-        cell.run(nod)
-    assert np.ptp(cell.session.buses.truth["q_rad"][:, 5]) == pytest.approx(0.2, abs=0.01)
-    assert np.ptp(cell.session.buses.truth["q_rad"][:, 0]) < 1e-3
 
 
 def test_what_is_no_controller_is_told_before_a_drive_is_enabled():

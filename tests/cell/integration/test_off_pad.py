@@ -17,8 +17,7 @@ from canprobe.errors import SafetyStop
 EDGE_M = 8 * 1.5875e-3
 
 
-@pytest.mark.parametrize("mode", ["window", "features"])
-def test_the_probe_lets_go_before_the_force_has_grown(mode):
+def test_the_probe_lets_go_before_the_force_has_grown():
     """A probe of 135 mm has a pad of 11 degrees, and the edge of the fillet turns by more than that within a second.
 
     The scene says a plane, as the plan would refuse the fillet.
@@ -28,7 +27,6 @@ def test_the_probe_lets_go_before_the_force_has_grown(mode):
         scene,
         task=replace(scene.task, strategy="straight", width_mm=9.0, wavelength_mm=12.0, rolling_share=0.36),
         probe=replace(scene.probe, radius_mm=135.0),
-        sensor=replace(scene.sensor, mode=mode),
         shape=replace(scene.shape, also=()),
     )
     flat = replace(scene, object=ObjectSettings("plane", scene.object.position_mm, scene.object.rotation_deg))
@@ -46,15 +44,13 @@ def test_the_probe_lets_go_before_the_force_has_grown(mode):
     assert truth["force_n"][-1] == 0.0
 
 
-@pytest.mark.parametrize(("array", "approach_mm_s"), [("icub-triangles", 2.1), ("poweron6x6", 3.2)])
-def test_a_cylinder_across_a_flat_array_is_let_go(array, approach_mm_s):
-    """It goes on beyond the array, listed or a grid: triangles of ten taxels read 2 N where 8 N pressed.
+def test_a_cylinder_across_a_flat_array_is_let_go():
+    """It goes on beyond the array: triangles of ten taxels read 2 N where 8 N pressed.
 
     The way back is measured at the tip: about a centre 10 m away counts of the encoders alone made the 6 mm of it.
     """
-    sensor = {"sensor.array": array, "sensor.channel": "can1"}
-    scene = canprobe.load_scene("press", sensor | {"task.approach_mm_s": approach_mm_s})
-    assert scene.object.kind == "cylinder"
+    sensor = {"sensor.array": "icub-triangles", "sensor.channel": "can1"}
+    scene = canprobe.load_scene("press", sensor | {"task.approach_mm_s": 2.1})
     with Session(scene) as session, pytest.raises(SafetyStop, match="the contact runs off the edge of the array"):
         session.run(make_task(session.plan))
     force = session.buses.truth["force_n"]

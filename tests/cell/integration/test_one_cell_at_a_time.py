@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import signal
 
 import numpy as np
@@ -14,7 +13,6 @@ import canprobe
 from canprobe.api import results_folder
 from canprobe.cell.master.controller import Command
 from canprobe.cell.npz import read_npz
-from canprobe.cell.results import summary as results
 from canprobe.cell.session import folder as recording
 from canprobe.cell.session.session import with_bridges
 from canprobe.cli import main
@@ -47,7 +45,9 @@ def nod(measurement):
 
 
 def test_a_controller_of_ones_own_leaves_what_a_run_leaves(free, tmp_path):
-    with canprobe.open_cell(undrawn(free), out=tmp_path / "own") as cell:
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "surface.npz").write_text("of an earlier run")
+    with canprobe.open_cell(undrawn(free), out=tmp_path / "own", force=True) as cell:
         result = cell.run(nod)
         with pytest.raises(UsageError, match=r"result\.summary: complete when the block of open_cell is left"):
             _ = result.summary["completed"]
@@ -73,9 +73,7 @@ def test_several_controllers_in_one_block_are_one_run(free, tmp_path):
         cell.run(nod)
 
 
-@pytest.mark.parametrize(
-    ("error", "reason"), [(ValueError("oh"), "ValueError: oh"), (SafetyStop("oh"), "oh"), (None, "oh")]
-)
+@pytest.mark.parametrize(("error", "reason"), [(ValueError("oh"), "ValueError: oh"), (None, "oh")])
 def test_a_block_that_is_left_by_an_error_leaves_its_files_too(free, tmp_path, error, reason):
     def fail(measurement):
         if measurement.cycle > 100 and error is not None:
@@ -90,26 +88,26 @@ def test_a_block_that_is_left_by_an_error_leaves_its_files_too(free, tmp_path, e
     assert {path.name for path in tmp_path.iterdir()} >= FILES
 
 
-def test_a_cell_that_is_not_opened_says_how(free):
+def test_a_cell_is_opened_once_and_used_while_it_is_open(free):
     cell = canprobe.open_cell(free)
     for use in (lambda: cell.run(nod), lambda: cell.cell):
         with pytest.raises(UsageError, match=r"use `with canprobe\.open_cell\(scene\) as cell:`"):
             use()
+    with cell:
+        with pytest.raises(UsageError, match="a session is opened once"):
+            cell.__enter__()
+        result = cell.run(nod)
+    assert len(result.log["t_s"]) > 100
 
 
 def test_results_replace_others_only_where_that_is_wanted(free, tmp_path, capsys):
-    scene, run = undrawn(free), ["run", "free", "--no-figures", "--duration", "0.1", "--out", str(tmp_path)]
+    run = ["run", "free", "--no-figures", "--duration", "0.1", "--out", str(tmp_path)]
     undrawn_run(free, out=tmp_path, duration_s=0.1)
     (tmp_path / "surface.npz").write_text("of an earlier run")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    for call in (canprobe.run, canprobe.open_cell):
-        with pytest.raises(UsageError, match="not empty: name another folder for the results"):
-            call(scene, out=tmp_path)
-    for words in (
-        run,
-        [*run, "--bus", "socketcan", "--channel", "nobus0"],
-        ["view", "free", *run[3:], "--html", "x.html"],
-    ):
+    with pytest.raises(UsageError, match="not empty: name another folder for the results"):
+        canprobe.open_cell(free, out=tmp_path)
+    for words in (run, ["view", "free", *run[3:], "--html", "x.html"]):
         assert main(words) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"canprobe: {tmp_path}: not empty") and "--force" in line
@@ -117,9 +115,6 @@ def test_results_replace_others_only_where_that_is_wanted(free, tmp_path, capsys
     assert main([*run, "--force", "--seed", "1"]) == 0
     assert not (tmp_path / "surface.npz").exists()
     assert json.loads((tmp_path / "summary.json").read_text())["seed"] == 1
-    with canprobe.open_cell(scene, out=tmp_path, force=True) as cell:
-        result = cell.run(nod)
-    assert result.summary["seed"] == 0
 
 
 def test_a_run_that_does_not_begin_replaces_nothing(free, tmp_path):
@@ -168,20 +163,15 @@ def test_a_controller_advances_in_pieces_as_in_one_run(free):
     assert seen["pieces"] == seen["whole"] and len(seen["whole"]) == 40
 
 
-@pytest.mark.parametrize("done", [np.array([True, False]), "no", None])
-def test_done_is_true_or_false(free, done):
-    with canprobe.open_cell(free) as cell, pytest.raises(UsageError, match="expected done to be True or False"):
-        cell.run(lambda _: Command(done=done))
-
-
 @pytest.mark.parametrize(
     ("field", "value", "says"),
     [
+        ("done", np.array([True, False]), "expected done to be True or False"),
+        ("done", None, "expected done to be True or False"),
         ("stop_reason", 3, "expected stop_reason to be a text or None, got 3"),
         ("stop_reason", " ", "expected stop_reason to be a text or None, got ' '"),
         ("columns", None, "expected columns to be a dict of numbers by name, got None"),
         ("columns", {3: 1.0}, r"expected the names of columns to be printable texts, got \[3\]"),
-        ("columns", {"": 1.0}, r"expected the names of columns to be printable texts, got \[''\]"),
         ("columns", {"a\0b": 1.0}, "expected the names of columns to be printable texts"),
         ("estimate", "flat", "expected estimate to be a SurfaceEstimate, got 'flat'"),
     ],
@@ -197,7 +187,7 @@ def test_a_joint_target_needs_an_arm():
 
 
 @pytest.mark.filterwarnings("ignore:log. 3 values of column 'odd'")
-@pytest.mark.parametrize("odd", [[1.0, [2.0, 3.0]], "text", 1j])
+@pytest.mark.parametrize("odd", [[1.0, [2.0, 3.0]], "text"])
 def test_a_column_that_is_no_number_costs_only_itself(free, tmp_path, odd):
     commands = iter([Command(columns={"odd": odd})] * 3 + [Command(columns={"even": 7.0}, done=True)])
     with canprobe.open_cell(undrawn(free), out=tmp_path) as cell:
@@ -206,49 +196,19 @@ def test_a_column_that_is_no_number_costs_only_itself(free, tmp_path, odd):
     assert np.isnan(log["odd"]).all() and np.nanmax(log["even"]) == 7.0
 
 
-@pytest.mark.parametrize("ended", [True, False])
-def test_a_session_is_opened_once(free, tmp_path, ended):
-    with canprobe.open_cell(undrawn(free), out=tmp_path) as cell:
-        if not ended:
-            with pytest.raises(UsageError, match="a session is opened once"):
-                cell.__enter__()
-    if ended:
-        with pytest.raises(UsageError, match="a session is opened once"):
-            cell.__enter__()
-    assert len(list(read_candump(tmp_path / "bus.log"))) > 100
-
-
-def test_the_scene_is_there_as_soon_as_the_log(free, tmp_path):
-    with canprobe.open_cell(undrawn(free), out=tmp_path):
-        assert canprobe.load_scene(tmp_path / "scene.toml").name == "free"
-
-
 def test_one_bridge_may_be_named_as_it_is(free):
     assert with_bridges(free, "mcap").bridge.use == with_bridges(free, ["mcap"]).bridge.use == ("mcap",)
     assert canprobe.open_cell(free, bridge="mcap").plan.scene.bridge.use == ("mcap",)
 
 
-@pytest.mark.parametrize("name", ["log.npz", "summary.json"])
-def test_an_interrupt_waits_until_the_results_are_written(free, tmp_path, monkeypatch, name):
-    for module, write in ((results, results.write_text), (recording, recording.write_npz)):
+def test_an_interrupt_waits_until_the_results_are_written(free, tmp_path, monkeypatch):
+    def interrupted(path, content, write=recording.write_npz):
+        if path.name == "log.npz":
+            signal.raise_signal(signal.SIGINT)
+        write(path, content)
 
-        def interrupted(path, content, write=write):
-            if path.name == name:
-                signal.raise_signal(signal.SIGINT)
-            write(path, content)
-
-        monkeypatch.setattr(module, write.__name__, interrupted)
+    monkeypatch.setattr(recording, "write_npz", interrupted)
     with pytest.raises(KeyboardInterrupt):
         undrawn_run(free, out=tmp_path, duration_s=0.1)
     assert {path.name for path in tmp_path.iterdir()} >= {"summary.json", "log.npz", "scene.toml", "bus.log"}
     assert len(canprobe.load_table(tmp_path / "log.npz")) > 10
-
-
-@pytest.mark.slow(reason="one more run")
-def test_the_truth_of_a_shorter_run_is_told(tmp_path):
-    scene = canprobe.load_scene("cylinder")
-    long = undrawn_run(scene, out=tmp_path / "long", duration_s=1.4)
-    undrawn_run(canprobe.load_scene("free"), out=tmp_path / "short", duration_s=0.1)
-    shutil.copy(tmp_path / "short" / "truth.npz", long.out / "truth.npz")
-    with pytest.raises(UsageError, match="truth"):
-        canprobe.replay(long.out)

@@ -29,7 +29,6 @@ def score(session, records):
     return score_shape(records, session.buses.truth, session.cell.log.arrays()["t_s"])
 
 
-@pytest.mark.slow(reason="a second path")
 def test_curvature_across_an_axial_path_is_observed_within_ten_percent(axial):
     session, controller = axial
     found = score(session, controller.shape.records)
@@ -42,13 +41,9 @@ def test_curvature_across_an_axial_path_is_observed_within_ten_percent(axial):
     assert last.method == "recursive+patch"
     truth = session.buses.truth["direction1"][-1]
     assert abs(last.directions[0] @ truth) > 0.99
-
-
-def test_the_first_answer_gives_the_force_no_knock(axial):
-    """The patch tells the curvature, and with it the depth for 2 N, in one instant."""
-    session, controller = axial
     first, last = controller.record().scan_cycles
-    assert session.buses.truth["force_n"][first:last].max() < 2.35
+    force = session.buses.truth["force_n"][first:last]
+    assert force.max() < 2.35, "the first answer, which tells the depth for 2 N in one instant, gives no knock"
 
 
 def test_without_the_patch_the_same_contacts_leave_it_unobserved(axial):
@@ -61,46 +56,7 @@ def test_without_the_patch_the_same_contacts_leave_it_unobserved(axial):
     assert list(records[-1].estimate.observed) == [True, False]
     assert records[-1].estimate.kappa[0] == pytest.approx(0.0, abs=1.0)
     assert np.isnan(records[-1].estimate.kappa[1])
-    times = session.cell.log.arrays()["t_s"]
-    shape = summarise_shape(off, None, {"recursive": records}, session.buses.truth, times)
-    assert shape["kappa_true_per_m"] == pytest.approx((1 / 0.036, 0.0), abs=1e-6)  # it is known all the same
-    assert shape_lines(shape) == [
-        f"  curvature  {records[-1].estimate.kappa[0]:.2f} 1/m, the other one not observed; true 27.78, 0.00 1/m",
-        "    recursive  not scored: no estimate of both curvatures after the first 20 mm",
-    ]
-
-
-def test_ml_takes_the_same_help_and_the_paper_s_method_takes_none(axial):
-    session, controller = axial
-    samples = controller.shape.samples
-    ml = replay_samples(make_shape_estimator(session.plan.setup.task, "ml"), samples, 40)[-1].estimate
-    assert ml.method == "ml+patch"
-    assert ml.kappa == pytest.approx([1 / 0.036, 0.0], abs=2.8)
-    paper = replay_samples(make_shape_estimator(session.plan.setup.task, "chen1996"), samples, 40)[-1].estimate
-    assert paper.method == "chen1996"
-    assert not paper.observed.all()
-
-
-def test_across_a_circumferential_path_the_curvature_is_0_within_2_per_m():
-    """Scored absolutely: there is nothing to divide by."""
-    scene = canprobe.load_scene(
-        "axial", {"task.duration_s": 1.8, "task.clearance_mm": 0.3, "cycle.rate_hz": 200.0, "bus.timed": False}
-    )
-    scene = replace(scene, task=replace(scene.task, heading_deg=110.0, length_mm=20.0))
-    session = Session(scene)
-    controller = make_task(session.plan)
-    with session:
-        session.run(controller)
-    late = [r.estimate for r in controller.shape.records if r.travelled_m > 0.02]
-    axis = np.array([np.cos(np.radians(20.0)), np.sin(np.radians(20.0)), 0.0])
-    along_axis, around = [], []
-    for e in late:
-        assert e.observed.all()
-        a = e.T_frame_contact[:3, :2].T @ axis
-        a /= np.linalg.norm(a)
-        b = np.array([-a[1], a[0]])
-        along_axis.append(a @ e.K @ a)
-        around.append(b @ e.K @ b)
-    assert len(late) >= 10
-    assert np.sqrt(np.mean(np.square(along_axis))) < 2.0
-    assert np.sqrt(np.mean(np.square(np.array(around) - 1 / 0.036))) < 1.0
+    shape = summarise_shape(off, None, {"recursive": records}, session.buses.truth, session.cell.log.arrays()["t_s"])
+    first, second = shape_lines(shape)
+    assert first.endswith("1/m, the other one not observed; true 27.78, 0.00 1/m"), "it is known all the same"
+    assert "not scored: no estimate of both curvatures" in second

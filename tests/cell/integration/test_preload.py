@@ -46,12 +46,3 @@ def test_a_larger_limit_lets_an_array_with_offsets_begin():
     reason, session = press_begun_pressed(preload_max_n=3.0)
     assert "before the run" not in reason
     assert np.ptp(session.buses.truth["q_rad"], axis=0).max() > 1e-3, "it began to move"
-
-
-def test_a_force_during_the_run_is_no_preload():
-    """Nor while its drives are off afterwards, which must not keep the probe from being taken off the object."""
-    scene = canprobe.load_scene("press", {"task.duration_s": 0.5})
-    with Session(scene) as session:
-        session.run(make_task(session.plan))
-    assert session.cell.supervisor.seen.preload < 0.15 and "preload" not in session.cell.supervisor.first
-    assert session.buses.truth["force_n"].max() > 1.5

@@ -40,23 +40,28 @@ def test_the_full_image_that_one_bus_could_not_carry_is_served_on_its_own(presse
     loads = summary["bus_load"]
     assert list(loads) == ["can0", "can1"]
     assert all(0 < load["measured"] < load["planned_worst"] < 1 for load in loads.values())
+    assert {name: report["as_planned"] for name, report in summary["traffic"].items()} == {"can0": True, "can1": True}
+
+
+def assert_pdos_on_their_bus(result, frames):
+    """And a recording of the log has each of them."""
+    ids = {name: {frame[2] for frame in frames if frame[1] == name} for name in ("can0", "can1")}
+    recording = read_recording(result.out / "bus.log", result.plan)
+    assert len(recording.syncs) == sum(frame[1:3] == ("can0", 0x080) for frame in frames)
+    for pdo in result.plan.pdos:
+        assert [name for name in ids if pdo.cob_id in ids[name]] == [pdo.channel]
+        assert sum(frame[0] == pdo.cob_id for frame in recording.frames) == sum(f[2] == pdo.cob_id for f in frames)
+    return ids
 
 
 def test_each_bus_has_its_own_nodes_and_every_bus_the_sync(pressed):
-    _, frames = pressed
-    ids = {name: {frame[2] for frame in frames if frame[1] == name} for name in ("can0", "can1")}
-    plan = canprobe.plan(split_scene())
-    for pdo in plan.pdos:
-        assert [name for name in ids if pdo.cob_id in ids[name]] == [pdo.channel]
+    result, frames = pressed
+    assert np.all(np.diff([frame[0] for frame in frames]) >= 0), "lines of both buses are in the order of time"
+    ids = assert_pdos_on_their_bus(result, frames)
     assert {0x590, 0x610, 0x710} <= ids["can1"] and not {0x590, 0x610, 0x710} & ids["can0"]
     assert {0x080, 0x000, 0x77F} <= ids["can0"] & ids["can1"]
     syncs = [[frame[3] for frame in frames if frame[1] == name and frame[2] == 0x080] for name in ids]
     assert syncs[0] == syncs[1]
-
-
-def test_lines_of_both_buses_are_in_the_order_of_time(pressed):
-    _, frames = pressed
-    assert np.all(np.diff([frame[0] for frame in frames]) >= 0)
 
 
 class Answering(Participant):
@@ -76,16 +81,12 @@ class Answering(Participant):
         return answer
 
 
-@pytest.fixture
-def joined():
+def test_a_joined_port_sends_where_a_frame_belongs_and_hears_all_in_order():
     clock = VirtualClock()
     buses = {"a": LockstepBus(clock, "a"), "b": LockstepBus(clock, "b")}
     buses["a"].attach(Answering(5_000_000))
     buses["b"].attach(Answering(3_000_000))
-    return JoinedPort({name: bus.port() for name, bus in buses.items()}, {0x201: "a", 0x301: "b"})
-
-
-def test_a_joined_port_sends_where_a_frame_belongs_and_hears_all_in_order(joined):
+    joined = JoinedPort({name: bus.port() for name, bus in buses.items()}, {0x201: "a", 0x301: "b"})
     joined.send_batch([(0x201, b"\x01"), (0x301, b"\x02")])
     assert joined.drain() == []
     joined.wait(100_000_000)
@@ -104,22 +105,6 @@ def test_a_joined_port_sends_where_a_frame_belongs_and_hears_all_in_order(joined
         joined.drain()
 
 
-def test_the_log_of_two_buses_is_read_as_the_one_the_cell_had(pressed):
-    result, frames = pressed
-    plan = result.plan
-    recording = read_recording(result.out / "bus.log", plan)
-    main = [frame for frame in frames if frame[1] == "can0" and frame[2] == 0x080]
-    assert len(recording.syncs) == len(main)
-    for pdo in plan.pdos:
-        assert sum(frame[0] == pdo.cob_id for frame in recording.frames) == sum(f[2] == pdo.cob_id for f in frames)
-
-
-def test_each_bus_is_measured_against_its_own_part_of_the_plan(pressed):
-    result, _ = pressed
-    assert all(report["as_planned"] for report in result.summary["traffic"].values())
-    assert set(result.summary["traffic"]) == {"can0", "can1"}
-
-
 def cut_session(scene, channel, lost_ns):
     """A session that loses one of its buses."""
     session = Session(scene)
@@ -130,6 +115,11 @@ def cut_session(scene, channel, lost_ns):
 
     session.buses._joined = cut
     return session
+
+
+def assert_drives_off(session):
+    words = [node.dictionary.number(0x6041) for node in session.buses.world.nodes if node.node_id <= 7]
+    assert not POWERED_STATES.intersection(map(state_of, words))
 
 
 def hold(measurement):
@@ -149,21 +139,25 @@ def test_the_arm_is_stopped_by_its_master_when_the_sensors_bus_is_lost():
 
         session.buses.lockstep.recorder = record
         session.run(hold)
-    words = [node.dictionary.number(0x6041) for node in session.buses.world.nodes if node.node_id <= 6]
-    assert not POWERED_STATES.intersection(map(state_of, words))
+    assert_drives_off(session)
     assert not [frame for frame in heard if 0x81 <= frame[0] <= 0x86]
     stops = [t for can_id, data, t in heard if can_id == 0x201 and t > 900_000_000 and data[0] & 0x06 == 0x02]
     assert stops and stops[0] < 910_000_000  # quick stop, within four cycles
 
 
-def test_the_sensor_is_let_go_when_the_arms_bus_is_lost():
-    session = cut_session(split_scene(), "can0", 900_000_000)
-    with pytest.raises(InterfaceError, match="can0: it is gone"), session:
+@pytest.mark.parametrize(
+    ("make_scene", "channel"),
+    [(split_scene, "can0"), (lambda: spread_scene(canprobe.load_scene("free"), 3), "can1")],
+    ids=["all drives", "three of them"],
+)
+def test_drives_whose_bus_is_lost_stop_by_themselves_and_all_nodes_of_the_other_one_are_let_go(make_scene, channel):
+    session = cut_session(make_scene(), channel, 900_000_000)
+    with pytest.raises(InterfaceError, match=f"{channel}: it is gone"), session:
         session.run(hold)
-    (sensor,) = [node for node in session.buses.world.nodes if node.node_id == 16]
-    assert sensor.state is NmtState.PRE_OPERATIONAL
-    words = [node.dictionary.number(0x6041) for node in session.buses.world.nodes if node.node_id <= 6]
-    assert not POWERED_STATES.intersection(map(state_of, words))  # by themselves
+    assert_drives_off(session)
+    on_lost_bus = {i for bus in session.plan.buses if bus.channel == channel for i in bus.node_ids}
+    others = [node for node in session.buses.world.nodes if node.node_id not in on_lost_bus]
+    assert {node.state for node in others} == {NmtState.PRE_OPERATIONAL}
 
 
 def test_a_bus_that_is_lost_is_told_once_and_the_others_go_on():
@@ -201,34 +195,15 @@ def spread_scene(scene, first):
     )
 
 
-@pytest.fixture(scope="module")
-def seven(tmp_path_factory):
-    out = tmp_path_factory.mktemp("seven")
-    scene = spread_scene(
-        canprobe.load_scene("cylinder", {"cell": "seven-axis", "task.clearance_mm": 0.3, "shape.also": []}), 4
-    )
-    return undrawn_run(scene, out=out, duration_s=0.1), list(read_candump(out / "bus.log"))
-
-
-def test_seven_drives_on_two_buses_have_room_for_their_torque_and_the_array(seven):
-    result, frames = seven
+def test_seven_drives_on_two_buses_have_room_for_their_torque_and_the_array(tmp_path):
+    keys = {"cell": "seven-axis", "task.clearance_mm": 0.3, "shape.also": []}
+    result = undrawn_run(spread_scene(canprobe.load_scene("cylinder", keys), 4), out=tmp_path, duration_s=0.1)
     summary, plan = result.summary, result.plan
     assert plan.setup.arm.torque and plan.sync.period_ns == 2_500_000
     assert [(bus.channel, bus.node_ids) for bus in plan.buses] == [("can0", (1, 2, 3, 4, 16)), ("can1", (5, 6, 7))]
     assert summary["completed"] and not summary["faults"] and summary["cycle"]["missed_pdos"] == 0
-    assert summary["contact"]["contact_fraction"] == 1.0
     assert all(report["as_planned"] for report in summary["traffic"].values())
-    assert not np.isnan(result.log["torque_permille"][-1]).any()
-    ids = {name: {frame[2] for frame in frames if frame[1] == name} for name in ("can0", "can1")}
-    for pdo in plan.pdos:
-        assert [name for name in ids if pdo.cob_id in ids[name]] == [pdo.channel]
-
-
-def test_a_recording_has_the_drives_of_both_buses(seven):
-    result, frames = seven
-    recording = read_recording(result.out / "bus.log", result.plan)
-    for pdo in result.plan.pdos:
-        assert sum(frame[0] == pdo.cob_id for frame in recording.frames) == sum(f[2] == pdo.cob_id for f in frames)
+    assert_pdos_on_their_bus(result, list(read_candump(tmp_path / "bus.log")))
 
 
 def test_the_controller_waits_for_the_slower_bus():
@@ -250,14 +225,3 @@ def test_targets_share_an_rpdo_only_with_a_drive_on_the_same_bus():
         if pdo.direction == "rpdo" and pdo.number == 2:
             shared.setdefault((pdo.channel, pdo.cob_id), []).append(pdo.node_id)
     assert sorted(shared.values()) == [[1, 2], [3], [4, 5], [6]]
-    free = spread_scene(canprobe.load_scene("free"), 3)
-    free = dataclasses.replace(free, arm=dataclasses.replace(free.arm, grouped_rpdo=True))
-    assert canprobe.run(free, files=False, duration_s=0.1).summary["completed"]
-
-
-def test_the_arm_is_stopped_when_one_of_its_buses_is_lost():
-    session = cut_session(spread_scene(canprobe.load_scene("free"), 3), "can1", 900_000_000)
-    with pytest.raises(InterfaceError, match="can1: it is gone"), session:
-        session.run(hold)
-    words = [node.dictionary.number(0x6041) for node in session.buses.world.nodes]
-    assert not POWERED_STATES.intersection(map(state_of, words))

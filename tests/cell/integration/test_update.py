@@ -105,22 +105,3 @@ def test_a_scan_carries_its_learning_one_step_a_cycle_and_none_where_an_image_is
     due = [sample.t_s for sample in list(task.shape.samples)[7::8]]
     assert task.shape.records[-1].t_s == due[-2]
     assert task.record().shape.records[-1].t_s == due[-1]
-
-
-def scanned(wrap):
-    """Its answers and targets, in a short scan."""
-    session = Session(canprobe.load_scene("cylinder", {"task.duration_s": 0.8}))
-    with session:
-        task = make_task(session.plan)
-        session.run(wrap(task))
-    return task.shape.records, session.cell.log.arrays()["q_target_rad"]
-
-
-@pytest.mark.slow(reason="two whole runs")
-def test_a_task_in_a_controller_that_never_updates_it_moves_and_answers_alike():
-    """Whoever wraps a task's `step` alone has its estimates none the less, and the same."""
-    (answers, targets), (wrapped, wrapped_targets) = scanned(lambda task: task), scanned(lambda task: task.step)
-    assert len(answers) > 5
-    assert [a.reported_s for a in answers] == [w.reported_s for w in wrapped]
-    np.testing.assert_array_equal([a.estimate.K for a in answers], [w.estimate.K for w in wrapped])
-    np.testing.assert_array_equal(targets, wrapped_targets)

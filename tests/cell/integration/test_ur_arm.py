@@ -1,7 +1,4 @@
-"""The example for an arm of Universal Robots: ur_rtde, against a controller in a process of its own.
-
-What it commands is not seen by the emulated array, whose plant is in another process: a whole cell moves in the air.
-"""
+"""The example for an arm of Universal Robots: ur_rtde, against a controller in a process of its own."""
 
 from __future__ import annotations
 
@@ -17,10 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from network_buses import group  # noqa: F401
 from patience import patience_s
 
-import canprobe
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 
 pytestmark = pytest.mark.skipif(
@@ -29,16 +24,6 @@ pytestmark = pytest.mark.skipif(
 ROOT = Path(__file__).parents[3]
 CLOCK_S = 86_400.0
 START = "0.5", "0", "0.4", "3.141592653589793", "0", "0"
-IN_THE_AIR = {
-    "cell": "external",
-    "cycle.rate_hz": 125,
-    "sensor.rate_hz": 125,
-    "arm.emulated": False,
-    "arm.start_mm": [500, 0, 400],
-    "arm.delay_ms": 16,
-    "arm.stop_after_ms": 5000,
-    "limits.late_cycles_max_percent": 100,
-}
 
 
 class Controller:
@@ -120,18 +105,3 @@ def test_the_controller_stops_the_arm_where_no_command_comes(controller: Control
                 arm.command(far)
                 time.sleep(0.008)
         arm.stop()
-
-
-@pytest.mark.realtime
-@pytest.mark.slow(reason="a cell in real time, with a process for its array and one for the arm's controller")
-def test_a_cell_moves_the_arm_by_its_own_clock(controller: Controller, ur_arm: Any, group: str) -> None:
-    with ur_arm(controller.host, silence_s=5.0, rate_hz=125.0) as arm:
-        bus = {"bus": "udp_multicast", "channel": group, "duration_s": 1.0}
-        result = canprobe.run("free", IN_THE_AIR, arm=arm, files=False, **bus)
-    assert result.summary["completed"]
-    offset_ms = result.summary["external_arm"]["clock_offset_ms"]
-    assert abs(offset_ms - 1e3 * (time.monotonic() - CLOCK_S)) < 1e3 * patience_s(60.0), "it is of another origin"
-    assert controller.next("servo")["flange"][:3] == pytest.approx([0.5, 0.0, 0.4], abs=1e-6), "from where it stood"
-    turned = result.log["q_m"]
-    assert np.ptp(turned[:, :3], axis=0).max() > 1e-4, "it has moved"
-    assert controller.next("end")["why"] == "stop"

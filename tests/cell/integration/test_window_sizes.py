@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
+from scenes import change
 from undrawn import undrawn_run
 
 import canprobe
@@ -13,61 +12,30 @@ import canprobe.fieldbus.eds.packaged
 from canprobe.cell.planning.array import patch_across_taxels, patch_radius_m, window_choices
 from canprobe.cell.planning.pdos import tactile_objects
 from canprobe.cell.plant.elastic_contact import elastic_contact
-from canprobe.cell.scene.load import dump_scene, parse_scene
+from canprobe.cell.scene.load import parse_scene
 from canprobe.cell.scene.resolve import resolve
 from canprobe.cell.scene.setup import Probe
 from canprobe.errors import PlanError, SceneError
-
-PDOS = {4: 3, 6: 6, 8: 9, 10: 14, 12: 19}
-
-
-def change(scene, **sections):
-    return dataclasses.replace(
-        scene, **{name: dataclasses.replace(getattr(scene, name), **keys) for name, keys in sections.items()}
-    )
 
 
 def tactile(plan):
     return [pdo for pdo in plan.pdos if pdo.kind == "tactile"]
 
 
-@pytest.fixture(scope="module")
-def press():
-    return change(
-        canprobe.load_scene("press", {"task.clearance_mm": 0.3}),
-        arm={"grouped_rpdo": True},
-        bus={"cob_ids": "by_deadline"},
-    )
-
-
-@pytest.mark.parametrize("side", [10])
-def test_what_is_planned_is_on_the_bus(press, side, tmp_path):
-    scene = change(press, sensor={"window": side})
-    result = undrawn_run(scene, out=tmp_path, duration_s=0.1)
-    assert len(tactile(result.plan)) == PDOS[side]
+def test_what_is_planned_is_on_the_bus(tmp_path):
+    keys = {"task.clearance_mm": 0.3, "arm.grouped_rpdo": True, "bus.cob_ids": "by_deadline", "sensor.window": 10}
+    result = undrawn_run(canprobe.load_scene("press", keys), out=tmp_path, duration_s=0.1)
+    assert len(tactile(result.plan)) == 14
     measured = canprobe.measure_traffic(tmp_path, result.plan)
     assert measured.as_planned and measured.unlisted == {} and measured.missing == ()
     (one,) = (one for one in measured.classes if one.kind == "tactile PDO")
     assert one.frames == pytest.approx(one.planned_frames, rel=0.02) and one.late == 0
     assert result.summary["cycle"]["torn_frames"] == 0
     (setup,) = (setup for setup in result.plan.nodes if setup.node_id == 16)
-    assert [(w.value, w.read_back) for w in setup.writes if w.index == 0x2008] == [(side, True)]
+    assert [(w.value, w.read_back) for w in setup.writes if w.index == 0x2008] == [(10, True)]
 
 
-@pytest.mark.slow(reason="two scans of a soft object")
-def test_a_soft_contact_is_felt_by_every_window_that_is_planned_for_it():
-    """The truth is the plant's: 10×10 taxels hold the patch of a soft pad; what 8×8 cut off is carried on."""
-    foam = canprobe.load_scene("foam")
-    assert canprobe.plan(foam).scene.sensor.window == 10
-    for scene in (foam, change(foam, sensor={"window": 8})):
-        contact = canprobe.run(scene, files=False, duration_s=1.0).summary["contact"]
-        assert contact["force_rms_error_n"] < 0.06 * contact["force_target_n"]
-
-
-# --- the choice -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("force, stiffness, radius_mm", [(2.0, 1.27e8, 40.0), (2.0, 2.3e7, 40.0), (0.5, 1e9, 20.0)])
+@pytest.mark.parametrize("force, stiffness, radius_mm", [(2.0, 2.3e7, 40.0), (0.5, 1e9, 20.0)])
 def test_the_planned_patch_is_the_plants_on_a_plane(force, stiffness, radius_mm):
     probe = Probe(np.eye(4), radius_mm * 1e-3, stiffness, 0.3)
     radius = patch_radius_m(force, probe)
@@ -135,8 +103,7 @@ def test_a_sensor_without_the_object_keeps_8(tmp_path):
     )
     path = tmp_path / "older.eds"
     path.write_text(older)
-    scene = canprobe.load_scene("press", {"task.clearance_mm": 0.3})
-    scene = change(scene, sensor={"eds": str(path), "window": "auto"})
+    scene = canprobe.load_scene("press", {"sensor.eds": str(path), "sensor.window": "auto"})
     plan = canprobe.plan(scene)
     assert plan.scene.sensor.window == 8
     assert ("another window", f"{path} has no window size (2008h), so the window keeps 8×8 taxels") in (
@@ -146,15 +113,12 @@ def test_a_sensor_without_the_object_keeps_8(tmp_path):
     assert not any(write.index == 0x2008 for write in setup.writes) and setup.left_out == ()
     with pytest.raises(PlanError, match=r"sensor\.window = 8, not 6"):
         canprobe.plan(change(scene, sensor={"window": 6}))
-    result = canprobe.run(plan.scene, files=False, duration_s=0.1)
-    assert result.summary["completed"] and result.summary["cycle"]["torn_frames"] == 0
 
 
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
         ("window = 7", "an integer of 4, 6, 8, 10, 12"),
-        ("window = 16", "an integer of 4, 6, 8, 10, 12"),
         ('window = "big"', '"auto"'),
         ('mode = "features"\nwindow = 8', "mode"),
     ],
@@ -162,10 +126,3 @@ def test_a_sensor_without_the_object_keeps_8(tmp_path):
 def test_the_key_is_strict(line, complaint):
     with pytest.raises(SceneError, match=complaint):
         parse_scene(f'[scene]\nname = "x"\n[task]\nkind = "listen"\n[sensor]\n{line}\n')
-
-
-@pytest.mark.parametrize("value", ["4", "12", '"auto"'])
-def test_the_key_comes_back_as_it_was_written(value):
-    scene = parse_scene(f'[scene]\nname = "x"\n[task]\nkind = "listen"\n[sensor]\nwindow = {value}\n')
-    assert parse_scene(dump_scene(scene)) == scene
-    assert str(scene.sensor.window) == value.strip('"')
