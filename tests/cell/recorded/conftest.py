@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from undrawn import undrawn, undrawn_run
+from undrawn import undrawn_run
 from wrapped import Wrapped
 
 import canprobe
@@ -21,14 +20,11 @@ from canprobe.fieldbus.bus.candump import CandumpWriter, RecordingPort
 from canprobe.fieldbus.bus.clock import VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus
 
-DURATION_S = 1.1
 
-
-def short_scan(*, patch=True, **task):
+def short_scan(**keys):
     """The cylinder with a scan of a second or so, and the online estimator alone."""
-    scene = canprobe.load_scene("cylinder", {"task.duration_s": DURATION_S})
-    scene = replace(scene, shape=replace(scene.shape, also=(), patch=patch))
-    return replace(scene, task=replace(scene.task, clearance_mm=0.8, **task))
+    quick = {"task.duration_s": 1.1, "task.clearance_mm": 0.8, "shape.also": ()}
+    return canprobe.load_scene("cylinder", quick | keys)
 
 
 class SleepyClock:
@@ -107,7 +103,7 @@ def replayed_log(lockstep_run):
 @pytest.fixture(scope="session")
 def motion_run(tmp_path_factory):
     """The same without the contact patch, whose share in an answer is taken or left: a small change may decide it."""
-    return undrawn_run(short_scan(patch=False), out=tmp_path_factory.mktemp("recorded") / "motion")
+    return undrawn_run(short_scan(**{"shape.patch": False}), out=tmp_path_factory.mktemp("recorded") / "motion")
 
 
 @pytest.fixture(scope="session")
@@ -132,18 +128,6 @@ def delayed_run(tmp_path_factory):
     write_npz(out / "log.npz", cell.log.columns())
     write_npz(out / "tactile.npz", cell.tactile_log.columns())
     return out, controller.task, cell
-
-
-@pytest.fixture(scope="session")
-def other_run(tmp_path_factory):
-    """The log of another controller on the same nodes: it goes elsewhere, softer and slower."""
-    out = tmp_path_factory.mktemp("recorded") / "other"
-    other = canprobe.plan(short_scan(force_n=1.5, speed_mm_s=20.0, heading_deg=100.0, wavelength_mm=8.0, search_mm=7.0))
-    task = make_task(other)
-    with contextlib.ExitStack() as stack:
-        session = stack.enter_context(canprobe.open_cell(undrawn(short_scan()), out=out))
-        session.run(task)
-    return out
 
 
 @pytest.fixture

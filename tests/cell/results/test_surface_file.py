@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.results.surface_file import FORMAT_VERSION, load_surface_map, save_surface_map
+from canprobe.cell.results.surface_file import load_surface_map, save_surface_map
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch import UncertainMatrix, fit_surface
@@ -63,15 +63,6 @@ def test_a_map_of_points_and_one_of_nothing_are_maps(tmp_path):
     assert (again.pad, again.stiffness, again.noise) == (None, None, points.noise)
     save_surface_map(SurfaceMap(None, PAD_NOISE), tmp_path / "surface.npz")
     assert len(load_surface_map(tmp_path)) == 0  # the folder of a run will do
-
-
-def test_columns_can_be_read_without_canprobe(surface_map, tmp_path):
-    save_surface_map(surface_map, tmp_path / "a.npz")
-    with np.load(tmp_path / "a.npz", allow_pickle=False) as columns:
-        assert int(columns["format_version"]) == FORMAT_VERSION
-        assert columns["contacts"].sum() == 360
-        np.testing.assert_array_equal(columns["centre_m"], surface_map.nodes.rows[:, nodes.CENTRE])
-        assert np.isnan(columns["patch_m2"][1])
 
 
 def test_all_of_s_of_the_answers_is_in_the_file(surface_map, tmp_path):
@@ -135,7 +126,6 @@ def _rewrite(path, **changes):
         ({"contacts": lambda c: 0.0 * c}, "contacts: expected numbers above 0, got 0"),
         ({"lateral_variance_m2": lambda c: c * np.inf}, "lateral_variance_m2: expected numbers above 0, got inf"),
         ({"stiffness_n_m3": lambda c: -c}, "stiffness_n_m3: expected numbers above 0, or NaN"),
-        ({"heading": lambda _: np.array({"a": 1}, dtype=object)}, "cannot be read: heading.npy holds Python objects"),
     ],
 )
 def test_wrong_files_are_refused(surface_map, tmp_path, changes, message):
@@ -147,20 +137,9 @@ def test_wrong_files_are_refused(surface_map, tmp_path, changes, message):
     assert str(path) in str(refused.value)
 
 
-def test_what_is_no_npz_is_refused(surface_map, tmp_path):
-    whole = tmp_path / "whole.npz"
-    save_surface_map(surface_map, whole)
-    for name, content in {
-        "empty": b"",
-        "text": b"not a map",
-        "cut": whole.read_bytes()[:2000],
-        "garbled": whole.read_bytes()[:700] + bytes(300) + whole.read_bytes()[1000:],
-    }.items():
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(UsageError, match=f"{name}: expected an npz file"):
-            load_surface_map(tmp_path / name)
-    np.save(tmp_path / "single.npy", np.zeros(3))
-    with pytest.raises(UsageError, match="expected an npz file with a surface map; cannot be read: a single array"):
-        load_surface_map(tmp_path / "single.npy")
+def test_what_is_no_npz_is_refused(tmp_path):
+    (tmp_path / "text").write_bytes(b"not a map")
+    with pytest.raises(UsageError, match="text: expected an npz file with a surface map; cannot be read: "):
+        load_surface_map(tmp_path / "text")
     with pytest.raises(UsageError, match=r"surface\.npz: no such file; a run writes"):
         load_surface_map(tmp_path)

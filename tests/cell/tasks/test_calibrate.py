@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 
 import canprobe
@@ -15,8 +13,7 @@ PERIOD_NS = 2_500_000
 
 def seconds_to_give_up(periods):
     """Time until no ball is found, where every cycle takes so many periods."""
-    scene = canprobe.load_scene("calibrate")
-    plan = canprobe.plan(replace(scene, task=replace(scene.task, touches=2, clearance_mm=1.0, search_mm=1.0)))
+    plan = canprobe.plan("calibrate", {"task.touches": 2, "task.clearance_mm": 1.0, "task.search_mm": 1.0})
     task = make_task(plan)
     q = plan.setup.arm.q_start
     for cycle in range(20_000):

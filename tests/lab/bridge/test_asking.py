@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from typing import get_args
 
 import pytest
-from patience import patience_s
 
 import canprobe
 from canprobe.cell.planning.bridges import BRIDGES, BridgeInfo, check_bridges
@@ -20,35 +17,23 @@ from canprobe.errors import SceneError, UsageError
 FREE = dump_scene(canprobe.load_scene("free"))
 
 
-def test_the_scene_knows_the_bridges_that_there_are():
+def test_the_scene_knows_the_bridges_that_there_are_each_a_module_with_an_extra(request):
     assert set(get_args(BridgeName)) == set(BRIDGES)
+    root = request.config.rootpath
+    for info in BRIDGES.values():
+        assert f"\n{info.extra} = [" in (root / "pyproject.toml").read_text()
+        assert root.joinpath("bridge", *info.module.split(".")).with_suffix(".py").is_file()
 
 
-@pytest.mark.parametrize("name", BRIDGES)
-def test_every_bridge_is_a_module_of_its_own_with_an_extra(name, request):
-    info = BRIDGES[name]
-    pyproject = (request.config.rootpath / "pyproject.toml").read_text()
-    assert f"\n{info.extra} = [" in pyproject
-    assert request.config.rootpath.joinpath("bridge", *info.module.split(".")).with_suffix(".py").is_file()
-
-
-def test_a_scene_that_asks_for_none_names_that_in_its_plan():
+def test_a_plan_names_the_bridges_that_its_scene_asks_for():
     plan = canprobe.plan(parse_scene(FREE))
     assert ("bridges to other tools", "no [bridge]: no other tool is fed") in plan.left_out
     assert plan_dict(plan)["bridges"] == [] and "run.mcap" not in plan.outputs
-
-
-def test_a_scene_that_asks_for_one_has_it_in_its_plan():
     plan = canprobe.plan(parse_scene(FREE + '[bridge]\nuse = ["mcap"]\n'))
+    assert plan.scene.bridge.ros2_loopback is True
     assert "run.mcap" in plan.outputs and plan_dict(plan)["bridges"] == ["mcap"]
     assert "mcap: one MCAP file" in plan_text(plan)
     assert not [what for what, _ in plan.left_out if "bridge" in what]
-
-
-def test_the_section_survives_its_way_to_a_file_and_back():
-    scene = parse_scene(FREE + '[bridge]\nuse = ["ros2", "mcap"]\nros2_domain = 7\nros2_commands = true\n')
-    assert parse_scene(dump_scene(scene)) == scene
-    assert scene.bridge.ros2_loopback is True
 
 
 @pytest.mark.parametrize(
@@ -65,12 +50,11 @@ def test_a_wrong_section_is_refused_with_its_key(section, complaint):
         parse_scene(FREE + f"[bridge]\n{section}\n")
 
 
-@pytest.mark.parametrize("command", ["run free", "up free --bus socketcan", "replay nothing"])
+@pytest.mark.parametrize("command", ["run free", "replay ."])
 def test_a_wrong_name_on_the_command_line_lists_what_there_is(command, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "nothing").mkdir()
-    (tmp_path / "nothing" / "bus.log").write_text("")
-    (tmp_path / "nothing" / "scene.toml").write_text(FREE)
+    (tmp_path / "bus.log").write_text("")
+    (tmp_path / "scene.toml").write_text(FREE)
     assert main([*command.split(), "--bridge", "foxglov"]) == 2
     error = capsys.readouterr().err
     assert "did you mean foxglove?" in error and all(f"{name} (" in error for name in BRIDGES)
@@ -84,20 +68,6 @@ def test_a_missing_extra_is_named_with_its_pip_line(monkeypatch):
         check_bridges(["mcap"])
     plan = canprobe.plan(parse_scene(FREE + '[bridge]\nuse = ["mcap"]\n'))
     assert [why for what, why in plan.not_available if what == "bridge mcap" and "pip install" in why]
-
-
-def test_a_run_without_a_bridge_imports_none():
-    program = (
-        "import sys, canprobe, canprobe.api, canprobe.cell.session, canprobe.cell.master.cycle\n"
-        "canprobe.run(canprobe.load_scene('free'), files=False, duration_s=0.05)\n"
-        "wrong = [m for m in sys.modules if m.split('.')[0] in ('rosbags', 'mcap', 'foxglove', 'cyclonedds', 'pandas')"
-        " or m.startswith('canprobe.lab.bridge.')]\n"
-        "print(wrong)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=patience_s(60)
-    )
-    assert done.stdout == "[]\n"
 
 
 def test_children_import_our_package_and_the_bridge_is_named_before_the_run(tmp_path, monkeypatch, capsys):

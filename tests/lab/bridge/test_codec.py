@@ -13,6 +13,7 @@ from canprobe.fieldbus.protocol.tactile import Features, TactileHeader, TactileM
 from canprobe.lab.bridge.pipe import pack_observation, unpack_observation
 from canprobe.lab.bridge.sampling import SampleSource
 
+FREE = canprobe.plan("free")
 WINDOW = TactileFrame(
     TactileHeader(7, 200, 3, 4, TactileMode.WINDOW, True, 5000, 0xBEEF),
     np.arange(256, dtype=np.uint8).reshape(16, 16),
@@ -32,10 +33,8 @@ FEATURES = TactileFrame(
 @pytest.mark.parametrize("frame", [WINDOW, FEATURES], ids=["window", "features"])
 def test_a_measurement_comes_out_as_it_went_in(frame):
     q = np.array([1e-9, -2.0, math.pi, 0.0, -0.0, 5.5])
-    words = (0x1237,) * 6
-    sent = Measurement(41, 102_500_000, q, (0, 1, 2, 0, 0, 0), (-5, 4, 3, 2, 1, 0), words, True, None, 2)
-    sample = TactileSample(frame, 97_500_000, 39)
-    sent = Measurement(*(getattr(sent, n) for n in sent.__slots__[:7]), sample, 2)
+    words, sample = (0x1237,) * 6, TactileSample(frame, 97_500_000, 39)
+    sent = Measurement(41, 102_500_000, q, (0, 1, 2, 0, 0, 0), (-5, 4, 3, 2, 1, 0), words, True, sample, 2)
     frames = [(0x80, b"\x01", 5), (0x80000123, b"12345678", 6), (0x40000181, b"", 7)]
     got = unpack_observation(pack_observation(Observation(99, sent, None, frames), 3))
     assert (got.t_ns, got.frames, got.dropped, got.phase, got.patch) == (99, frames, 3, None, None)
@@ -51,8 +50,9 @@ def test_a_measurement_comes_out_as_it_went_in(frame):
 
 
 def test_frames_alone_and_a_command_without_an_arm():
-    got = unpack_observation(pack_observation(Observation(5, None, None, [])))
+    got = unpack_observation(pack_observation(Observation(5, None, None, []), 17))
     assert got.measurement is None and got.frames == []
+    assert SampleSource(FREE).sample(got).dropped == 17, "samples lost before it, which a viewer is shown"
     command = Command(columns={"phase": 3.0, "force_n": 1.0})
     got = unpack_observation(pack_observation(Observation(5, Measurement(0, 0), command, [])))
     assert got.phase == 3.0 and got.measurement.q is None
@@ -68,7 +68,7 @@ def test_a_controller_of_ones_own_may_call_anything_a_phase(value, phase):
     command = Command(columns={"phase": value})
     got = unpack_observation(pack_observation(Observation(5, Measurement(0, 0), command, [])))
     assert got.phase == phase
-    sample = SampleSource(canprobe.plan(canprobe.load_scene("free"))).sample(got)
+    sample = SampleSource(FREE).sample(got)
     assert sample.phase == ("scan" if phase == 3.0 else None)
 
 

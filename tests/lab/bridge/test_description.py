@@ -9,7 +9,6 @@ import pytest
 
 import canprobe
 from canprobe.lab.bridge.description import axis_transforms, link_transforms, robot_description
-from canprobe.mechanics.robot.urdf import from_urdf
 
 ARRAYS = Path(canprobe.__file__).parent / "arrays"
 MESH = """<visual><geometry><mesh filename="arm.stl" scale="2 2 2"/></geometry></visual>
@@ -38,11 +37,6 @@ def test_pinocchio_finds_every_frame_where_tf_has_it(plan):
             np.testing.assert_allclose(found[link], T, atol=1e-9)
             np.testing.assert_allclose(found[f"axis_{i}"], T @ axes[f"axis_{i}"], atol=1e-9)
         np.testing.assert_allclose(data.oMf[model.getFrameId("flange")].homogeneous, T, atol=1e-9)
-
-
-def test_a_cell_can_be_made_of_the_description_again(plan):
-    again = from_urdf(robot_description(plan), "base_link", "flange")
-    assert [joint.q_min for joint in again.joints] == pytest.approx([j.q_min for j in plan.setup.arm.model.joints])
 
 
 def test_an_arm_is_seen_and_ends_in_its_probe(plan, press_plan):

@@ -102,7 +102,6 @@ def test_the_scene_allows_further_origins_and_their_hosts(name, served):
         assert handshake(port, name, "app.foxglove.dev", "https://app.foxglove.dev")[0] == 403
 
 
-@pytest.mark.parametrize("name", ["foxglove", "view"])
 @pytest.mark.parametrize(
     ("head", "code"),
     [
@@ -117,8 +116,8 @@ def test_the_scene_allows_further_origins_and_their_hosts(name, served):
     ],
     ids=["no host", "two hosts", "two origins", "space", "folded", "empty", "bracket", "long"],
 )
-def test_a_head_that_could_be_read_in_two_ways_is_refused(name, head, code, served):
-    assert status(served[name, False], head.encode()) == code
+def test_a_head_that_could_be_read_in_two_ways_is_refused(head, code, served):
+    assert status(served["view", False], head.encode()) == code
 
 
 def test_pages_are_refused_too_and_come_whole_where_they_are_not(served):

@@ -1,9 +1,8 @@
-"""The MCAP file of a run, read back by two independent readers and held against what the run wrote elsewhere."""
+"""The MCAP file of a run, read back by a reader of its own and held against what the run wrote elsewhere."""
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import cantools
 import numpy as np
@@ -11,13 +10,11 @@ import pytest
 from full_disk import room_for
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.highlevel import AnyReader
-from undrawn import undrawn_run
 
 import canprobe
-import canprobe.errors
 from canprobe.cell.recorded.reestimate import replay_into
 from canprobe.cli import main
+from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.lab.bridge.messages import Encoder, Messages
@@ -67,13 +64,9 @@ def test_profile_encodings_and_attachments(recorded):
 
 
 def test_nothing_is_dropped_in_lockstep_and_the_summary_says_so(recorded):
-    status = recorded.result.summary["bridges"]["mcap"]
-    assert status == {
-        "samples": len(recorded.observations),
-        "dropped": 0,
-        "where": str(recorded.folder / "run.mcap"),
-        "error": None,
-    }
+    where = str(recorded.folder / "run.mcap")
+    status = {"samples": len(recorded.observations), "dropped": 0, "where": where, "error": None}
+    assert recorded.result.summary["bridges"]["mcap"] == status
     assert "bridge     mcap:" in recorded.result.text()
     assert recorded.result.summary["cycle"]["observe_us"]["p50"] > 0
 
@@ -103,6 +96,10 @@ def by_cycle(recorded, rows):
     return {cycles[time]: ros for time, ros in rows}
 
 
+def vector(v):
+    return (v.x, v.y, v.z)
+
+
 def test_force_and_contact_are_those_the_task_logged(recorded, decoded):
     """The force to rounding, the place to 0.2 µm: both were computed again, in another process, from the measurement.
 
@@ -114,16 +111,14 @@ def test_force_and_contact_are_those_the_task_logged(recorded, decoded):
     felt = [vector(wrenches[cycle[row]].wrench.force) for row in new]
     np.testing.assert_allclose(np.linalg.norm(felt, axis=1), force[new], rtol=1e-12)
     assert force[new].max() == pytest.approx(2.0, abs=0.5)
+    pressed = [r.wrench.force.z for _, r in decoded["/wrench"] if abs(r.wrench.force.z) > 0.5]
+    assert len(pressed) > 50 and max(pressed) < 0, "z of the probe points at the object, which pushes back"
     touched = new[np.isfinite(points[new]).all(axis=1)]
     tf = [(t, ros) for t, ros in decoded["/tf"] if ros.transforms[0].child_frame_id == "contact"]
     contacts = by_cycle(recorded, tf)
     found = [vector(contacts[cycle[row]].transforms[0].transform.translation) for row in touched]
     assert len(found) > 100
     np.testing.assert_allclose(found, points[touched] * 1e-3, rtol=0, atol=2e-7)
-
-
-def vector(v):
-    return (v.x, v.y, v.z)
 
 
 def test_contacts_on_a_carrier_are_in_its_frame_which_moves_in_base(tmp_path):
@@ -153,12 +148,6 @@ def test_contacts_on_a_carrier_are_in_its_frame_which_moves_in_base(tmp_path):
         assert np.linalg.norm(seen[:3] - moment.contact.point) == pytest.approx(0.04, abs=2e-3)
 
 
-def test_the_force_pushes_the_probe_back(decoded):
-    """In the probe's frame, whose z points at the object, the object pushes towards −z."""
-    pressed = [r.wrench.force.z for _, r in decoded["/wrench"] if abs(r.wrench.force.z) > 0.5]
-    assert len(pressed) > 50 and max(pressed) < 0
-
-
 def test_the_surface_patch_lies_on_the_true_cylinder(recorded, decoded):
     scene = recorded.result.plan.scene
     _, cloud = decoded["/surface_patch"][-1]
@@ -175,19 +164,11 @@ def test_the_surface_patch_lies_on_the_true_cylinder(recorded, decoded):
     assert np.abs(distance[near] - RADIUS).max() < 3e-4
 
 
-def test_both_readers_see_the_same_messages(recorded):
-    path = recorded.folder / "run.mcap"
-    with AnyReader([path]) as reader:
-        theirs = [(c.topic, t, bytes(raw)) for c, t, raw in reader.messages()]
-        connection = next(c for c in reader.connections if c.topic == "/taxels/image")
-        image = max(
-            (reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages([connection])),
-            key=lambda ros: ros.data.sum(),
-        )
-    assert sorted(theirs) == sorted(messages_of(path))
-    assert (image.encoding, image.data.shape, image.step) == ("mono8", (256,), 16)
-    rows, columns = np.nonzero(image.data.reshape(16, 16))
-    assert rows.max() - rows.min() < 8 and columns.max() - columns.min() < 8  # one patch within the window
+def test_the_image_of_the_taxels_shows_one_patch_within_the_window(decoded):
+    image = max((ros for _, ros in decoded["/taxels/image"]), key=lambda ros: sum(ros.data))
+    assert (image.encoding, len(image.data), image.step) == ("mono8", 256, 16)
+    rows, columns = np.nonzero(np.frombuffer(bytes(image.data), np.uint8).reshape(16, 16))
+    assert rows.max() - rows.min() < 8 and columns.max() - columns.min() < 8
 
 
 @pytest.mark.slow(reason="writes the whole file once more")
@@ -236,19 +217,6 @@ def test_frames_of_can_fd_have_a_topic_of_their_own(recorded):
     assert (frame.id, frame.len, bytes(frame.data)) == (0x181, 64, data)
 
 
-@pytest.mark.slow(reason="a second scene into a file")
-def test_a_log_without_a_shape_goes_into_a_file_too(tmp_path):
-    undrawn_run(canprobe.load_scene("free"), out=tmp_path, duration_s=0.1)
-    with (tmp_path / "scene.toml").open("a") as scene:
-        scene.write('\n[bridge]\nuse = ["ros2"]\n')  # fed the run, not its replay
-    replayed = replay_into(tmp_path, ("mcap",))
-    assert replayed.result is None and replayed.bridges.keys() == {"mcap"}
-    topics = [topic for topic, _, _ in messages_of(tmp_path / "run.mcap")]
-    assert topics.count("/joint_states") > 40 and "/wrench" not in topics
-
-
-@pytest.mark.slow(reason="one more run")
 def test_a_run_without_a_folder_cannot_have_a_file():
-    with pytest.raises(canprobe.errors.UsageError, match="bridge mcap: it writes a file"):
-        canprobe.run(canprobe.load_scene("free"), duration_s=0.1, files=False, bridge=("mcap",))
-    assert not Path("runs").exists() or not list(Path("runs").glob("free-*"))
+    with pytest.raises(UsageError, match="bridge mcap: it writes a file"):
+        canprobe.run("free", duration_s=0.1, files=False, bridge=("mcap",))

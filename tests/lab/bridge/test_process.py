@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import subprocess
-import sys
 
 import pytest
-from mcap.reader import make_reader
-from patience import patience_s
-from waiting import wait_for_size
 
 import canprobe
 from canprobe.cell.master.observers import Observation
@@ -112,30 +106,3 @@ def test_one_that_cannot_begin_stops_the_run_before_anything_is_sent(tmp_path):
     blocked.write_text("")
     with pytest.raises(ResultsError, match=r"bridge mcap: .*(Not a directory|File exists)"):
         canprobe.run(canprobe.load_scene("free"), out=blocked / "run", bridge=("mcap",), duration_s=0.1)
-
-
-def test_samples_count_what_was_dropped_before_them(plan):
-    """What the viewer is shown of losses: the number travels with the next sample."""
-    from canprobe.lab.bridge.pipe import pack_observation, unpack_observation
-    from canprobe.lab.bridge.sampling import SampleSource
-
-    sample = SampleSource(plan).sample(unpack_observation(pack_observation(Observation(0, None, None, []), 17)))
-    assert sample.dropped == 17
-
-
-def test_an_interrupt_ends_run_and_bridge_with_a_whole_file(tmp_path):
-    """Ctrl-C at a terminal goes to the whole group; the run ends as always, and the file is closed properly."""
-    command = [sys.executable, "-m", "canprobe", "run", "free", "--duration", "600", "--no-figures", "--bridge", "mcap"]
-    run = subprocess.Popen([*command, "--out", tmp_path], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    try:
-        wait_for_size(tmp_path / "bus.log", 100_000, run)
-        run.send_signal(signal.SIGINT)
-        _, error = run.communicate(timeout=patience_s(60))
-    finally:
-        run.kill()
-    assert run.returncode == 130 and b"interrupted" in error
-    with (tmp_path / "run.mcap").open("rb") as file:
-        reader = make_reader(file)
-        assert reader.get_summary().statistics.message_count > 1000
-        summary = json.loads(next(a.data for a in reader.iter_attachments() if a.name == "summary.json"))
-    assert summary["stop_reason"] == "interrupted" and summary["bridges"]["mcap"]["dropped"] == 0

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
-from puma_arm import MODELS
 
 import canprobe
 from canprobe.cell.plant.pressure import pad_coordinates
@@ -19,14 +19,11 @@ from canprobe.lab.bridge.view import colours, links
 from canprobe.lab.bridge.view import object_sheet as objects
 from canprobe.lab.bridge.view.path import PathAhead, deviation_scale
 from canprobe.lab.bridge.view.surface import LIFT_M, GrowingSurface, drawn, map_of_points
-from canprobe.mechanics.robot.chain import forward, link_frames, posture
+from canprobe.mechanics.robot.chain import link_frames, posture
 from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS, make_object
 from canprobe.mechanics.touch.pad import Pad
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
-
-MODEL = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
-QS = np.random.default_rng(2).uniform(-2.5, 2.5, (20, 6))
 
 
 def winding(mesh, point):
@@ -49,18 +46,6 @@ def face_middles(mesh):
 
 
 # the arm
-
-
-@MODEL
-@pytest.mark.parametrize("q", QS[:6])
-def test_link_frames_end_at_the_flange_and_pass_the_wrist(model, q):
-    frames = link_frames(model.chain, q)
-    assert frames[6] == pytest.approx(forward(model.chain, q), abs=1e-14)
-    c = posture(model.chain, q)
-    wrist = c.origins[4]
-    assert frames[4][:3, 3] == pytest.approx(wrist, abs=1e-14) and frames[5][:3, 3] == pytest.approx(wrist, abs=1e-14)
-    assert frames[1][:3, 2] == pytest.approx(c.axes[1], abs=1e-14)
-    assert frames[3][:3, 2] == pytest.approx(c.axes[3], abs=1e-14)
 
 
 @pytest.mark.parametrize("cell", ["puma260", "seven-axis", "gantry"])
@@ -166,23 +151,17 @@ def touched(angles, radius=0.05):
 
 
 def test_the_recovered_surface_lies_on_the_ball_and_has_the_colours_of_what_is_known():
-    class Scene:
-        def __init__(self):
-            self.solids = []
-
-        def add_mesh_trimesh(self, name, solid, **_):
-            self.solids.append((name, solid))
-
-    scene, scale = Scene(), deviation_scale(None, None)
+    solids, scale = [], deviation_scale(None, None)
+    scene = SimpleNamespace(add_mesh_trimesh=lambda name, solid, **_: solids.append((name, solid)))
     surface = GrowingSurface(scene, scale, 0.04)
     surface.refresh()
-    assert not scene.solids  # nothing was touched
+    assert not solids  # nothing was touched
     for angles in (np.arange(-0.5, 0.0, 0.005), np.arange(0.0, 0.5, 0.005)):
         for one in touched(angles):
             surface.add(one)
         surface.refresh()
     surface.refresh()  # nothing new: nothing is sent
-    (_, half), (name, solid) = scene.solids
+    (_, half), (name, solid) = solids
     assert name == "/surface"
     assert np.linalg.norm(solid.vertices, axis=1) == pytest.approx(0.05 + LIFT_M, abs=10e-6)
     assert np.ptp(np.arctan2(solid.vertices[:, 0], solid.vertices[:, 2])) == pytest.approx(1.14, abs=0.06)
@@ -192,13 +171,6 @@ def test_the_recovered_surface_lies_on_the_ball_and_has_the_colours_of_what_is_k
 
 
 def test_an_exploration_is_coloured_by_what_it_does_not_know_and_shows_the_path_ahead():
-    class Scene:
-        def __init__(self):
-            self.lines = {}
-
-        def add_line_segments(self, name, segments, *_, **__):
-            self.lines[name] = segments
-
     scale = deviation_scale(None, canprobe.plan("explore").setup.scan)
     surface = map_of_points(0.04)
     contacts = list(touched(np.arange(-0.2, 0.2, 0.005)))
@@ -207,13 +179,15 @@ def test_an_exploration_is_coloured_by_what_it_does_not_know_and_shows_the_path_
     sure, unsure = mesh.sigma.argmin(), mesh.sigma.argmax()
     assert colours[sure].sum() > colours[unsure].sum()  # bright for a small deviation of the height
     assert "height" in scale.text
-    scene = Scene()
-    ahead = PathAhead(scene)
+    lines = {}
+    ahead = PathAhead(
+        SimpleNamespace(add_line_segments=lambda name, segments, *_, **__: lines.update({name: segments}))
+    )
     ahead.refresh()
-    assert not scene.lines
+    assert not lines
     ahead.take(np.arange(12.0).reshape(4, 3))
     ahead.refresh()
-    assert scene.lines["/ahead"].shape == (3, 2, 3)
+    assert lines["/ahead"].shape == (3, 2, 3)
 
 
 # colours

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-import canprobe
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cli import main
 from canprobe.lab.bridge.view.links import arm_links
 
@@ -84,30 +82,3 @@ def test_a_run_shows_the_meshes_as_long_as_they_are_there(lab, tmp_path, capsys)
     assert notes == [line]
     parts, _ = drawn(out / "scene.toml")
     assert {part.frame for part in parts if not part.name.startswith("solid")} == {0, 1, 2}
-
-
-CHANGED = pytest.mark.slow(reason="a changed mesh is told as one that is gone")
-
-
-@pytest.mark.parametrize("left", [None, pytest.param(b"nothing that can be read", marks=CHANGED)])
-def test_meshes_that_vanish_or_change_during_a_run_cost_only_their_picture(lab, tmp_path, capsys, left):
-    """A run folder refers to them: robots have tens of megabytes of meshes, and no result needs them."""
-    out, seen = tmp_path / "run", []
-    (lab / "free.toml").write_text('cell = "cell.toml"\n[scene]\nname = "free"\n[task]\nkind = "free"\n')
-
-    def change_amid(observation):
-        seen.append(observation)
-        if len(seen) == 20:
-            for mesh in (tmp_path / "lab" / "meshes").iterdir():
-                mesh.unlink() if left is None else mesh.write_bytes(left)
-
-    scene = load_scene(lab / "free.toml", {"task.duration_s": 0.2, "outputs.figures": False})
-    with canprobe.open_cell(scene, out=out, bridge=["mcap"], observers=[change_amid]) as cell:
-        cell.run(make_task(cell.plan))
-    assert len(seen) > 40
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["completed"] and summary["bridges"]["mcap"]["error"] is None
-    assert {"log.npz", "truth.npz", "scene.toml", "lab.urdf", "run.mcap"} <= {path.name for path in out.iterdir()}
-    assert main(["view", str(out), "--html", str(tmp_path / "page.html")]) == 0
-    why = "not found beside the URDF" if left is None else "cannot be read: "
-    assert re.search(rf"lab\.urdf: (base\.stl|arm\.obj).*: {why}.*; simple links are drawn", capsys.readouterr().err)

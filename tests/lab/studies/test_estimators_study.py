@@ -54,6 +54,8 @@ def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
     assert {"commit", "machine", "model", "seeds"} <= set(document["facts"])
     (bound,) = document["more"]
     assert {r["surface"] for r in bound["rows"]} == set(SURFACES)
+    ratios = [r["ratio"] for r in bound["rows"] if r["inside"] and r["method"] == "ml"]
+    assert 0.6 < np.median(ratios) < 1.3
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
         "cells.jsonl",

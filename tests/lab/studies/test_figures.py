@@ -1,11 +1,8 @@
 """Every picture can be read where it is shown: in a column of 800 pixels, with nothing over anything else."""
 
-import dataclasses
-import functools
 import itertools
 from dataclasses import replace
 
-import bridges_bench as bridges
 import matplotlib.image
 import numpy as np
 import pytest
@@ -18,21 +15,11 @@ from matplotlib.transforms import Bbox
 import canprobe
 from canprobe.cell.results.figures import draw_run
 from canprobe.cell.results.plan_figure import draw_plan
-from canprobe.cell.results.surface_figure import draw_surface
-from canprobe.lab.studies import estimators, exploration, fault_cases, stability, workprec
+from canprobe.lab.studies import fault_cases, workprec
 from canprobe.lab.studies import faults as faults_study
 from canprobe.lab.studies.bound import NOISES, SIZES_M, draw_bound
-from canprobe.lab.studies.estimators import draw_estimators
-from canprobe.lab.studies.figure import FORCE_AXIS, draw_by_name, draw_points
 from canprobe.lab.studies.ground import SURFACES
-from canprobe.lab.studies.random_scenes import KINDS, SceneSeed
-from canprobe.lab.studies.realtime import Measured, draw_realtime
 from canprobe.lab.studies.realtime_soak import draw_soak
-from canprobe.lab.studies.region_scores import ScoredScan
-from canprobe.lab.studies.regions import draw_regions, rows_of
-from canprobe.lab.studies.stability_extremes import END_MARKS, EXTREMES, ExtremeCase, draw_extremes, value_in_words
-from canprobe.lab.studies.surface_methods import METHODS
-from canprobe.lab.studies.surfaces import draw_surfaces
 from canprobe.lab.studies.workprec import draw_workprec
 
 COLUMN_PX, WIDEST_PX, LEAST_TYPE_PX, LEAST_BAR_PX = 800, 1400, 9.0, 4.0
@@ -40,21 +27,12 @@ FILLED, TILES = 0.3, 3
 """Share of a panel's height that nine tenths of its data take; parts of a sheet across and down, none is empty."""
 
 
-@functools.cache
-def run_of(scene, seconds):
-    return canprobe.run(scene, {"cycle.rate_hz": 200.0}, bus="direct", duration_s=seconds, files=False)
-
-
-def draw_scene(scene, seconds, *, draw=draw_run, **summary):
+def draw_scene(scene, seconds, **summary):
     def drawing(path):
-        result = run_of(scene, seconds)
-        draw(dataclasses.replace(result.data, summary=result.summary | summary), path)
+        result = canprobe.run(scene, {"cycle.rate_hz": 200.0}, bus="direct", duration_s=seconds, files=False)
+        draw_run(replace(result.data, summary=result.summary | summary), path)
 
     return drawing
-
-
-def one_of(names, i):
-    return names[i % len(names)]
 
 
 def bound(path):
@@ -70,155 +48,34 @@ def bound(path):
     draw_bound(rows, path)
 
 
-def every_estimator(path):
-    cost = {"chen1996": 400.0, "chord": 60.0, "ml": 500.0, "recursive": 90.0}
-    rows = [
-        {"surface": surface, "sigma_point_um": 1e6 * point, "sigma_normal_mrad": 1e3 * normal, "method": s.method,
-         "window_samples": s.window, "lag_samples": s.lag, "add_us": 1e2, "answer_us": cost[s.method] * s.window / 40,
-         **{key: share * 4e7 * point / s.window * (1 + (s.lag or 0) / 10)
-            for key, share in (("error_percent", 1.0), ("error_low_percent", 0.8), ("error_high_percent", 1.25))},
-         "bound_percent": 2e7 * point / (480 if s.method == "recursive" else s.window)}
-        for surface, _ in estimators.GROUNDS
-        for point, normal in estimators.NOISES
-        for s in estimators.settings()
-    ]  # fmt: skip
-    draw_estimators(rows, path)
-
-
-def regions(path):
-    rng, scans = np.random.default_rng(0), []
-    for kind, number in itertools.product(KINDS, range(12)):
-        error, ratio = 10 ** rng.uniform(-1, 1), 10 ** rng.normal(-0.03 * KINDS.index(kind), 0.2)
-        square = (error * rng.normal(size=(50, 3))) ** 2 @ (1.0, 1.0, 1.0)
-        stated = np.full(50, 3 * (ratio * error) ** 2)
-        scores = np.stack([np.arange(50), square, stated, 3 * square / stated, -square], axis=1)
-        seed = SceneSeed(2, kind, number).value()
-        facts = (seed, kind, kind, "prbt", "foreign" if kind == "foreign" else "shipped", "weave", 25.0, 2.0, 100.0)
-        scans.append(ScoredScan(*facts, 0.0, "", 60, scores, 0, scores[:0]))
-    draw_regions(rows_of(scans), scans, path)
-
-
-def plant(path, stiffnesses=workprec.STIFFNESSES, steps=workprec.STEPS_US):
+def plant(path):
+    stiffnesses = workprec.STIFFNESSES[:2]
     floors = {k: {"force_percent": 1e-6, "position_um": 1e-6, "taxel_counts": 1e-6} for k in stiffnesses}
     rows = [
         {"stiffness_n_m3": k, "method": method, "step_us": step, "held": held, "stands": i > 0,
          "cost_us": 2e5 / step * (1 + i), **{key: 1e-6 * step**2 / (1 + i) for key in floors[k]}}
         for k in stiffnesses
         for i, method in enumerate(workprec.METHODS)
-        for step in steps
+        for step in workprec.STEPS_US[1:3]
         for held in (True, False)
     ]  # fmt: skip
     draw_workprec(rows, floors, path)
 
 
-def faults(count):
+def faults(path):
     rng = np.random.default_rng(0)
     ends = ("completed", "stopped for safety", "bus or node failure", "bring-up refused")
     runs = [
-        {"kind": one_of(fault_cases.KINDS, i).name, "outcome": rng.choice(ends), "failures": [],
-         "force_share": rng.lognormal(-0.7, 0.3)}
-        for i in range(count)
-    ]  # fmt: skip
-    return lambda path: faults_study.draw_runs(runs, path)
-
-
-def wrong_files(path):
-    rows = [
-        {"file": case.what, "plant": case.plant, "force_max_n": 3.0 + 0.3 * i}
-        for i, case in enumerate(fault_cases.wrong_files(6))
+        {"kind": kind.name, "outcome": rng.choice(ends), "failures": [], "force_share": rng.lognormal(-0.7, 0.3)}
+        for kind in fault_cases.KINDS[:8]
     ]
-    title = "Highest true force of a first touch with a wrong file"
-    draw_by_name(rows, "file", FORCE_AXIS, path, title=title, by="plant")
-
-
-def ends(path):
-    kinds = ("nodes killed", "nodes stopped", "master killed", "master stopped", "link down", "queue full")
-    rows = [{"fault": k, "ended_s": 0.2 + 0.3 * i, "failed": i == 3} for i, k in enumerate(kinds)]
-    title = "How long the master took to end after processes were killed or stopped, or the link failed, on vcan0"
-    draw_by_name(rows, "fault", ("ended_s", "from the fault to the end (s)"), path, title=title, by="failed", log=False)
-
-
-def map_of_touches(path):
-    """Four buses with a few contacts."""
-    cases = [case for case in stability.cases(False) if case.rate_hz != 200.0 and case.late_ms != 6.0]
-    names = ("stable", "stopped", "approach", "refused")
-    rows = [
-        stability.row_of(case, {"ended": one_of(names, i), "reason": REASON})
-        for i, case in enumerate(case for case in cases if case.contact_n_m in (1e3, 1e5))
-    ]
-    stability.draw_stability(rows, path)
-
-
-def extremes(path):
-    cases = [ExtremeCase(name, value, scan) for name in EXTREMES for value in EXTREMES[name][0] for scan in (0, 1)]
-    draw_extremes(
-        [{"extreme": case.extreme, "value": value_in_words(case), "task": ("press", "scan")[case.scan],
-          "ended": one_of(list(END_MARKS), i)} for i, case in enumerate(cases)],
-        path,
-    )  # fmt: skip
-
-
-def realtime(path):
-    rng = np.random.default_rng(0)
-
-    def measured(case, mode, rate, held):
-        late, some = (1e3 * rng.lognormal(mean, 0.6, 4000) for mean in (4, 6))
-        some = some.astype(int)
-        return Measured(case, mode, rate, late.astype(int), 4000 / held, some, 2 * some, 3 * some)
-
-    cases = [measured(case, "window", 400.0, 400.0) for case in ("whole controller", "bare clock")]
-    held = [measured("hold", mode, rate, rate - 30 * i) for i, mode in enumerate(("features", "window", "image"))
-            for rate in (200.0, 400.0, 1000.0)]  # fmt: skip
-    draw_realtime([*cases, *held], path)
+    faults_study.draw_runs(runs, path)
 
 
 def soak(path):
     still = {"master_mib": 128.0, "nodes_mib": 84.0, "monitor_mib": 86.0, "missed_pdos": 0}
     samples = [still | {"t_s": 60.0 * k, "overruns": k // 9, "latency_us": 400.0 + 90 * np.sin(k)} for k in range(61)]
     draw_soak(samples, path)
-
-
-def predicted(path):
-    rows = [
-        {
-            "kind": one_of(("machine", "still", "slow"), i),
-            "seen": 0.02 * 1.3**i,
-            "told": 0.02 * 1.3**i * (1 + i % 4 / 5),
-        }
-        for i in range(30)
-    ]
-    lines = ((1.0, "as predicted"),)
-    draw_points(
-        rows, ("seen", "seen, %"), ("told", "predicted, %"), path, title="Overruns", by="kind", log=True, lines=lines
-    )
-
-
-def surfaces_of_methods(path):
-    rng, rows = np.random.default_rng(0), []
-    for name, (_, settings, _) in METHODS.items():
-        for k, _ in enumerate(settings):
-            scores = dict(
-                zip(("height_um", "normal_mrad", "curvature_per_m", "nll"), rng.uniform(1, 40, 4), strict=True)
-            )
-            rows.append({"method": name, "cpu_s": 0.02 * 2**k * rng.uniform(1, 2), **scores})
-    draw_surfaces(rows, path)
-
-
-def paths(path):
-    marks = np.arange(1, 51) * exploration.MARK_M
-    each = {
-        name: [{"path": marks.tolist(), **{key: (limit * (0.3 + i / 9 + 0.02 / marks)).tolist()
-                                           for key, limit in exploration.LIMITS.items()}}]
-        for i, name in enumerate(exploration.STRATEGIES)
-    }  # fmt: skip
-    exploration.draw(each, path)
-
-
-def bridge_bars(path):
-    names = ("none", "mcap", "foxglove", "ros2", "view", "mcap + foxglove + ros2")
-    rows = [{"bridge": name, "watched": "–", "added_p50_us": 40 + 9 * i, "added_p99_us": 150 + 200 * i}
-            for i, name in enumerate(names)]  # fmt: skip
-    bridges._draw(rows, path)
 
 
 def plan_with_a_pdo_that_is_not_used():
@@ -236,37 +93,21 @@ REASON = (
 )
 PICTURES = {
     "plane, stopped": draw_scene("plane", 1.5, completed=False, stop_reason=REASON),
-    "axial, surface": draw_scene("axial", 1.5, draw=draw_surface),
     "free": draw_scene("free", 1.0),
-    "press": draw_scene("press", 0.5),
+    "press, calibrate": draw_scene("press", 0.5, calibration=FOUND),
     "listen": draw_scene("listen", 1.0),
-    "calibrate": draw_scene("press", 0.5, calibration=FOUND),
     "plan": lambda path: draw_plan(plan_with_a_pdo_that_is_not_used(), path),
     "bound": bound,
-    "estimators": every_estimator,
-    "regions": regions,
     "workprec": plant,
-    "workprec, quick": functools.partial(plant, stiffnesses=workprec.STIFFNESSES[:2], steps=workprec.STEPS_US[1:3]),
-    "faults": faults(1020),
-    "faults, quick": faults(8),
-    "faults, files": wrong_files,
-    "faults, vcan": ends,
-    "stability": map_of_touches,
-    "stability, extremes": extremes,
-    "predicted": predicted,
-    "surfaces": surfaces_of_methods,
-    "exploration": paths,
-    "realtime": realtime,
+    "faults": faults,
     "soak": soak,
-    "bridges": bridge_bars,
 }
+OF_OTHER_TASKS = pytest.mark.slow(reason="the picture of one more task")
 
 
-SHOWN = ("plane, stopped", "plan", "bound", "faults, quick", "soak")
-OTHERS = pytest.mark.slow(reason="one more picture; the default draws one of each kind")
-
-
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[OTHERS] * (name not in SHOWN)) for name in PICTURES])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[OF_OTHER_TASKS] * (name[:4] in ("free", "pres", "list"))) for name in PICTURES]
+)
 def test_a_picture_can_be_read(name, tmp_path, monkeypatch):
     sheet, texts = drawn(PICTURES[name], tmp_path / "picture.png", monkeypatch)
     wrong = list(defects(sheet, texts, matplotlib.image.imread(tmp_path / "picture.png")[..., :3]))

@@ -1,21 +1,17 @@
 """`run_many`: every combination and seed once, the results of single runs, failures as rows, resumed, in any script."""
 
 import json
-import multiprocessing
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 from patience import patience_s
-from waiting import wait_until
 
 import canprobe
-from canprobe.cell.planning.make import make_plan
-from canprobe.errors import SceneError, StudyError, UsageError
+from canprobe.errors import SceneError, UsageError
 from canprobe.fieldbus.eds.packaged import eds_path
 from canprobe.lab.studies import many
-from canprobe.lab.studies.cell_store import CellStore
 from canprobe.lab.studies.many import run_many
 from canprobe.lab.studies.sweep import Sweep
 
@@ -121,16 +117,6 @@ def test_other_estimators_compute_where_they_are_asked_for(tmp_path, monkeypatch
     assert asked == [(), ("ml",), ()]
 
 
-def test_one_plan_serves_all_seeds_of_a_combination(monkeypatch):
-    planned = []
-    monkeypatch.setattr(many, "make_plan", lambda setup: planned.append(setup.seed) or make_plan(setup))
-    scene = many.dump_scene(canprobe.load_scene("press", QUICK | {"bus.interface": "direct", "task.force_n": 1.5}))
-    first, other = (many.measure(many.RunCase(scene, "", seed, ("truth.force_n",), 10.0)) for seed in (3, 4))
-    assert len(planned) == 1
-    assert first["summary"]["contact"] != other["summary"]["contact"]
-    assert [one["summary"]["seed"] for one in (first, other)] == [3, 4]
-
-
 def test_numbers_of_numpy_are_integers_as_others(tmp_path, monkeypatch):
     monkeypatch.setattr(Sweep, "map", lambda *_: [])
     seeds = [np.int64(3), np.uint8(4), 5]
@@ -150,7 +136,6 @@ def test_numbers_of_numpy_are_integers_as_others(tmp_path, monkeypatch):
         ({"seeds": [-1]}, r"scene\.seed: expected an integer from 0"),
         ({"seeds": 0}, "seeds: expected at least one, got 0"),
         ({"seeds": []}, r"seeds: expected at least one, got \[\]"),
-        ({"seeds": 1.5}, "seeds: expected a number, or a list of integers, got 1.5"),
         ({"seeds": [1.5]}, r"seeds: expected a number, or a list of integers, got \[1\.5\]"),
         ({"bus": "socketcan"}, 'runs share no bus: expected bus="direct" or "lockstep"'),
     ],
@@ -180,55 +165,3 @@ def test_a_script_needs_no_guard(tmp_path):
     assert ended.returncode == 0, ended.stderr
     assert json.loads(ended.stdout) == ["done", "done"] and ended.stderr == ""
     assert (tmp_path / "runs/many-listen/cells.jsonl").is_file()
-
-
-@pytest.mark.slow(reason="processes that are ended and go on")
-def test_after_any_end_every_run_is_there_once(tmp_path, monkeypatch):
-    """A kill, the death of a worker and Ctrl-C, one after the other: nothing is left running, lost or done twice."""
-    kept = tmp_path / "cells.jsonl"
-    script = (
-        "import canprobe, sys\n"
-        "scene = canprobe.load_scene('listen', {'task.duration_s': 0.05})\n"
-        "canprobe.run_many(scene, seeds=60, bus='direct', workers=1, out=sys.argv[1], progress=False)\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stderr=subprocess.PIPE)
-    wait_until(
-        lambda: kept.exists() and kept.read_bytes().count(b"\n") > 8,
-        lambda: process.poll() is None,
-        process.communicate,
-    )
-    process.kill()
-    process.communicate(timeout=patience_s(30))  # ends when no worker can print any more
-    lines = [kept.read_bytes().count(b"\n")]
-
-    def run():
-        scene = canprobe.load_scene("listen", {"task.duration_s": 0.05})
-        return run_many(scene, seeds=60, bus="direct", workers=1, out=tmp_path, progress=False)
-
-    def kill_a_worker():
-        multiprocessing.active_children()[0].kill()
-
-    def interrupt():
-        raise KeyboardInterrupt
-
-    put = CellStore.put
-    for end, error in ((kill_a_worker, StudyError), (interrupt, KeyboardInterrupt)):
-        more = []
-
-        def put_and_end(store, *what, end=end, more=more):
-            put(store, *what)  # Ctrl-C comes when the line is written, and its run not yet counted as kept
-            more.append(what)
-            if len(more) == 9:
-                end()
-
-        monkeypatch.setattr(CellStore, "put", put_and_end)
-        with pytest.raises(error):
-            run()
-        assert not multiprocessing.active_children()
-        lines.append(kept.read_bytes().count(b"\n"))
-    assert 8 < lines[0] < lines[1] < lines[2] < 60
-    monkeypatch.undo()
-    assert [outcome["summary"]["seed"] for outcome in run().outcomes] == list(range(60))
-    store = CellStore(tmp_path)
-    assert len(store.answers) == 60 == kept.read_bytes().count(b"\n") - store.damaged  # no run twice
-    store.close()

@@ -6,8 +6,6 @@ import os
 import numpy as np
 import pytest
 
-from canprobe.cli import main
-from canprobe.fieldbus.bus.real.socketcan import has_socketcan
 from canprobe.lab.studies.realtime import Measured, findings, holding_scene
 from canprobe.lab.studies.realtime_soak import findings as findings_of_soak
 from canprobe.lab.studies.realtime_soak import resident_mib
@@ -33,12 +31,6 @@ def test_findings_tell_rates_and_shares():
     assert "p99 is 20 % of the period until the commands are out, 30 % with" in text
     assert "features: 400 Hz held without overruns of 400, 500 Hz" in text
     assert "image: no rate held" in text
-
-
-@pytest.mark.skipif(has_socketcan(), reason="this kernel has SocketCAN")
-def test_without_socketcan_the_way_is_told(capsys, tmp_path):
-    assert main(["study", "realtime", "--quick", "--out", str(tmp_path)]) == 3
-    assert "canprobe vcan -- COMMAND" in capsys.readouterr().err
 
 
 def test_the_studies_scenes_leave_every_node_to_a_process_of_its_own():

@@ -1,4 +1,4 @@
-"""Cells that lose something by chance come back; the runs of `study faults --recover`, twenty of its seeds."""
+"""Cells that lose something by chance come back; the runs of `study faults --recover`, a few of its seeds."""
 
 from __future__ import annotations
 
@@ -10,26 +10,21 @@ from canprobe.cli import main
 from canprobe.lab.studies.recover import findings, run_case, table_rows
 from canprobe.lab.studies.recover_runs import Outage, RecoverCase, draw_case, shrink
 
-MORE = pytest.mark.slow(reason="more seeds of a study")
 
-
-@pytest.mark.parametrize("seed", [1, 2, *(pytest.param(seed, marks=MORE) for seed in (0, *range(3, 20)))])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_cell_comes_back_from_what_a_seed_takes(seed):
     outcome = run_case(draw_case(seed))
+    if seed == 2:
+        assert outcome == run_case(draw_case(seed)), "a seed is the same run again"
+        assert table_rows([outcome])[-1]["runs"] == 1 and findings([outcome])
     assert outcome["failures"] == [], outcome
     assert outcome["jump_counts"] <= 1 and outcome["force_max_n"] <= outcome["force_limit_n"]
     assert outcome["rows_lost"] == 0 and outcome["back"] + outcome["refused"] == outcome["lost"]
 
 
-@pytest.mark.parametrize("seed", [182, pytest.param(272, marks=MORE)])
-def test_a_joint_that_stops_in_a_scan_does_not_press_the_others_into_the_object(seed):
-    outcome = run_case(draw_case(seed))
+def test_a_joint_that_stops_in_a_scan_does_not_press_the_others_into_the_object():
+    outcome = run_case(draw_case(182))
     assert outcome["lost"] >= 1 and outcome["force_max_n"] <= outcome["force_limit_n"]
-
-
-def test_the_same_seed_is_the_same_run():
-    first, second = run_case(draw_case(2)), run_case(draw_case(2))
-    assert first == second and table_rows([first])[-1]["runs"] == 1 and findings([first])
 
 
 def test_a_failure_is_shrunk_to_the_loss_that_makes_it():

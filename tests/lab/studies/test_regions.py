@@ -148,28 +148,6 @@ def test_random_scenes_follow_from_their_seeds(tmp_path):
         SceneSeed.of(299_000)
 
 
-@pytest.mark.slow(reason="a scene of a study")
-def test_a_calibrated_array_has_the_gains_that_were_calibrated(tmp_path):
-    drawn = random_scene(SceneSeed(2, "plane", 1).value(), tmp_path)
-    assert drawn.group == "calibrated" and drawn.array is not None
-    found = resolve(drawn.scene).array.calibration
-    gains = np.array(found.gains)
-    touched = gains != 1.0  # by another array's touches the correlation is about 0
-    assert np.corrcoef(gains[touched], drawn.array.gains[touched])[0, 1] > 0.7
-    assert found.image.stiffness == pytest.approx(drawn.scene.plant.stiffness_n_m3, rel=0.1)
-
-
-@pytest.mark.slow(reason="a scene of a study")
-def test_the_line_of_a_seed_repeats_its_scene(capsys):
-    """A plane, whose regions hold the truth; the same numbers twice."""
-    assert main(["study", "regions", "--seed", "200000", "--json", "-v"]) == 0
-    out, err = capsys.readouterr()
-    found = json.loads(out)
-    assert (found["kind"], found["seed"], found["failures"]) == ("plane", 200_000, [])
-    assert found["answers"] >= 20 and found["share"] > 0.8
-    assert err.count("region holds") + err.count("region misses") == found["answers"]
-
-
 @pytest.mark.parametrize(
     "words, expected",
     [

@@ -219,12 +219,7 @@ def test_only_one_study_writes_into_a_folder(tmp_path):
     CellStore(tmp_path).close()
 
 
-OTHER_SIGNAL = pytest.mark.slow(reason="a third way to end a sweep")
-
-
-@pytest.mark.parametrize(
-    ("fate", "status"), [("SIGKILL", -9), ("SIGINT", 130), pytest.param("SIGTERM", 143, marks=OTHER_SIGNAL)]
-)
+@pytest.mark.parametrize(("fate", "status"), [("SIGKILL", -9), ("SIGINT", 130)])
 def test_an_ended_sweep_goes_on_where_it_was(demo, tmp_path, fate, status):
     ended = run_demo(tmp_path, fate)
     assert ended.returncode == status, ended.stderr
@@ -245,15 +240,6 @@ def test_a_dead_worker_is_told(demo, tmp_path):
     assert ended.returncode == 3
     assert "canprobe: a worker was killed" in ended.stderr
     assert "3 of 6 cells are kept" in run_demo(tmp_path).stderr
-
-
-def test_a_pool_that_is_left_by_an_exception_is_ended(demo):
-    pids = []
-    with pytest.raises(KeyError), process_pool(2) as pool:
-        pids += [pool.submit(os.getpid).result() for _ in range(4)]
-        pool.submit(signal.pause)
-        raise KeyError
-    assert pids and all(gone(pid) for pid in pids)
 
 
 def hear_nothing(deaf):

@@ -8,21 +8,7 @@ import pytest
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.cli import main
 from canprobe.lab.studies import workprec
-from canprobe.lab.studies.workprec import (
-    ENOUGH,
-    IntegrationCase,
-    cases,
-    choice,
-    errors,
-    findings,
-    integrated,
-    knee,
-    observed,
-    solve,
-    stands,
-    trial,
-    verdict,
-)
+from canprobe.lab.studies.workprec import ENOUGH, IntegrationCase
 
 CYCLES = 3
 PAD = 1.27e8
@@ -30,14 +16,14 @@ PAD = 1.27e8
 
 @pytest.fixture(scope="module")
 def truth():
-    return observed(PAD, np.array(solve(IntegrationCase(PAD, "radau", 1e-10, False, CYCLES, 1))))
+    return workprec.observed(PAD, np.array(workprec.solve(IntegrationCase(PAD, "radau", 1e-10, False, CYCLES, 1))))
 
 
 def errors_of(truth, method, step_us, held):
-    found = integrated(
-        PAD, trial(PAD, CYCLES)[1], Dynamics(integrator=method, step_ns=round(1000 * step_us)), held=held
+    found = workprec.integrated(
+        PAD, workprec.trial(PAD, CYCLES)[1], Dynamics(integrator=method, step_ns=round(1000 * step_us)), held=held
     )
-    return errors(truth, observed(PAD, found))
+    return workprec.errors(truth, workprec.observed(PAD, found))
 
 
 def test_the_whole_plant_converges_with_the_order_of_its_step(truth):
@@ -55,14 +41,14 @@ def test_holding_dynamics_over_a_cycle_is_an_error_of_its_own(truth):
 def row(method, cost, force, *, held=True, step=625.0, stiffness=PAD, stands=True):
     found = {"stiffness_n_m3": stiffness, "held": held, "method": method, "step_us": step, "cost_us": cost}
     found |= {"force_percent": force, "position_um": None if force is None else 0.1 * force, "taxel_counts": 0.0}
-    return found | {"stands": stands, "verdict": verdict(found)}
+    return found | {"stands": stands, "verdict": workprec.verdict(found)}
 
 
 def test_the_knee_is_the_cheapest_that_is_accurate_enough():
     rows = [row("a", 5.0, 1.01 * ENOUGH["force_percent"]), row("b", 7.0, 0.9), row("c", 6.0, None), row("d", 9.0, 1e-5)]
     assert [r["verdict"] for r in rows] == ["coarse", "enough", "broke down", "enough"]
-    assert knee(rows, PAD)["method"] == "b"
-    assert knee(rows[:1], PAD) is None
+    assert workprec.knee(rows, PAD)["method"] == "b"
+    assert workprec.knee(rows[:1], PAD) is None
 
 
 def test_the_choice_is_accurate_over_the_span_and_stands():
@@ -72,19 +58,19 @@ def test_the_choice_is_accurate_over_the_span_and_stands():
     good = over_the_span("rosenbrock", 9.0, 625.0)
     rows = [*good, *over_the_span("rk4", 2.0, 625.0, stands=False), row("rosenbrock", 1.0, 0.5, step=1250.0)]
     rows.append(row("rosenbrock", 1.0, 3.0, step=1250.0, stiffness=1.27e9))
-    assert choice(rows) == ("rosenbrock", 625.0)
-    assert "is rosenbrock at 625 µs; the default is rosenbrock at 625 µs" in findings(rows, {})[0]
-    assert choice(rows[3:]) is None
-    said = "\n".join(findings(rows, {PAD: dict.fromkeys(ENOUGH, 1e-9)}))
+    assert workprec.choice(rows) == ("rosenbrock", 625.0)
+    assert "is rosenbrock at 625 µs; the default is rosenbrock at 625 µs" in workprec.findings(rows, {})[0]
+    assert workprec.choice(rows[3:]) is None
+    said = "\n".join(workprec.findings(rows, {PAD: dict.fromkeys(ENOUGH, 1e-9)}))
     assert "cheapest that is accurate enough rosenbrock at 1250 µs, held, 1 µs a cycle" in said
     assert "the default, rosenbrock at 625 µs, held, 9 µs a cycle (force 0.5 %" in said
 
 
 def test_quick_cells_cover_every_method_and_free_dynamics_too():
-    quick = cases(True)
+    quick = workprec.cases(True)
     assert {c.method for c in quick if c.held} == set(workprec.METHODS)
     assert any(not c.held for c in quick)
-    assert len(quick) < len(cases(False)) / 4
+    assert len(quick) < len(workprec.cases(False)) / 4
 
 
 def test_a_cell_measures_states_and_cost():
@@ -96,7 +82,7 @@ def test_a_cell_measures_states_and_cost():
 @pytest.mark.parametrize(("method", "step_us", "quiet"), [("rosenbrock", 625.0, True), ("rk4", 1250.0, False)])
 def test_explicit_steps_rattle_at_rest_and_linearly_implicit_ones_do_not(method, step_us, quiet):
     for stiffness in (workprec.STIFFEST, PAD):
-        assert stands(IntegrationCase(stiffness, method, step_us, True, 40, 1)) is quiet
+        assert workprec.stands(IntegrationCase(stiffness, method, step_us, True, 40, 1)) is quiet
 
 
 def test_without_mujoco_it_is_refused_at_once(monkeypatch, capsys, tmp_path):
