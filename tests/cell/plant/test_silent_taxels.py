@@ -17,10 +17,6 @@ def row(number, columns=range(16)):
     return tuple((number, column) for column in columns)
 
 
-def column(number):
-    return tuple((place, number) for place in range(16))
-
-
 def images(force, dead=(), uv=(0.3, 0.2), kappa=CYLINDER, *, seed=0, pad=None):
     """Images of the emulated array, one a look: none pressed, force growing over five, then held."""
     pad = pad or Pad()
@@ -44,15 +40,13 @@ def force_of(finder, image, window=None):
     return compute_patch(finder.bridged(image, window or (0, 0, *image.shape))[0], PatchCalibration(), window).force
 
 
-@pytest.mark.parametrize("force", [1.0, 2.0, 5.0])
 @pytest.mark.parametrize(
-    ("dead", "words"),
+    ("force", "dead", "words"),
     [
-        (row(7), "row 7 of the array reads nothing"),
-        (row(6), "row 6 of the array reads nothing"),
-        (column(8), "column 8 of the array reads nothing"),
-        (row(7, (7, 8)), "row 7 of the array reads nothing in columns 7 to 8"),
-        (((7, 7),), "the taxel in row 7, column 7 of the array reads nothing"),
+        (1.0, row(7), "row 7 of the array reads nothing"),
+        (5.0, tuple((place, 8) for place in range(16)), "column 8 of the array reads nothing"),
+        (2.0, row(7, (7, 8)), "row 7 of the array reads nothing in columns 7 to 8"),
+        (2.0, ((7, 7),), "the taxel in row 7, column 7 of the array reads nothing"),
     ],
 )
 def test_what_reads_nothing_is_found_named_and_bridged(force, dead, words):
@@ -97,7 +91,7 @@ def test_one_dead_row_anywhere_under_random_contacts():
     assert len(errors) > 20 and np.mean(np.array(errors) < 0.05) > 0.95
 
 
-@pytest.mark.parametrize("side", [(16, 16), (8, 8), (12, 6), (5, 20)])
+@pytest.mark.parametrize("side", [(16, 16), (5, 20)])
 def test_nothing_is_found_on_a_whole_array(side):
     """Small patches, large ones, saturated ones, and at the edge of the pad."""
     rng = np.random.default_rng(sum(side))
