@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.resources
-import math
 import re
 
 import pytest
@@ -10,13 +9,11 @@ from makes import write_eds
 from scenes import change, reasons, refused, ways_out, with_joints, without_torque
 
 import canprobe
-from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.planning.identifiers import identifier_problems
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.measured import expected_messages
 from canprobe.cell.planning.model import PlannedPdo
 from canprobe.cell.planning.node_configuration import Interpolation
-from canprobe.cell.planning.report import plan_dict
 from canprobe.cell.planning.traffic import controller_starts
 from canprobe.cell.scene.load import dump_scene, load_scene, parse_scene
 from canprobe.cell.scene.resolve import resolve
@@ -64,17 +61,6 @@ def test_budget_table(name, sections, part, bits_per_second, percent):
     assert dict(plan.traffic.parts)["heartbeats"] == pytest.approx(heartbeats)
 
 
-@pytest.mark.parametrize(
-    ("sections", "drives_us", "tactile_us"),
-    [({}, 1565, 4345), ({"arm": {"grouped_rpdo": True}}, 1280, 3775)],
-)
-def test_peak_demand_behind_one_sync(press, sections, drives_us, tactile_us):
-    plan = canprobe.plan(change(press, **sections))
-    one, two = plan.traffic.demands
-    assert (one.cycles, one.used_ns, one.available_ns) == (1, drives_us * 1000, 2_500_000)
-    assert (two.cycles, two.used_ns, two.available_ns) == (2, tactile_us * 1000, 5_000_000)
-
-
 def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(press):
     error = refused(change(press, sensor={"mode": "image"}))
     assert any("worst-case load 152 %" in problem for problem in error.problems)
@@ -89,20 +75,9 @@ def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(press):
     assert str(error).splitlines()[-1] == f"  {error.ways_out[-1]}"
 
 
-OTHER_REFUSALS = pytest.mark.slow(reason="other refusals; tests/cli/test_advice.py types what drawn ones advise")
-
-
-@pytest.mark.parametrize(
-    "sections",
-    [
-        {"sensor": {"mode": "image"}},
-        pytest.param({"bus": {"transmit_queue": "fifo"}}, marks=OTHER_REFUSALS),
-        pytest.param({"cycle": {"rate_hz": 500.0}, "sensor": {"rate_hz": 250.0}}, marks=OTHER_REFUSALS),
-    ],
-)
-def test_ways_out_written_into_the_scene_file_make_it_fit(press, sections):
+def test_ways_out_written_into_the_scene_file_make_it_fit(press):
     """As a user would: what a way out names goes into the file, nothing else."""
-    follow_ways_out(change(press, **sections))
+    follow_ways_out(change(press, sensor={"mode": "image"}))
 
 
 def follow_ways_out(scene):
@@ -165,9 +140,7 @@ def test_six_drives_alone_end_at_500_hz():
     assert any("worst-case load" in problem for problem in reasons(change(free, cycle={"rate_hz": 1000.0})))
 
 
-@pytest.mark.parametrize(
-    ("rate", "period_us", "units"), [(400, 2500, 25), (500, 2000, 20), (200, 5000, 50), (40, 25_000, 250)]
-)
+@pytest.mark.parametrize(("rate", "period_us", "units"), [(400, 2500, 25), (40, 25_000, 250)])
 def test_sync_period(rate, period_us, units):
     plan = canprobe.plan(change(load_scene("free"), cycle={"rate_hz": float(rate)}))
     sync = plan.sync
@@ -175,7 +148,7 @@ def test_sync_period(rate, period_us, units):
     assert {node.interpolation[0] for node in plan.nodes} == {Interpolation(units, -4)}, "as the device has it"
 
 
-@pytest.mark.parametrize("rate", [333.333, 1000 / 3, 333.3333])
+@pytest.mark.parametrize("rate", [333.333, 1000 / 3])
 def test_a_rate_with_six_digits_is_the_rate_of_a_whole_period(rate):
     assert canprobe.plan(change(load_scene("free"), cycle={"rate_hz": rate})).sync.period_ns == 3_000_000
 
@@ -205,7 +178,7 @@ def test_tactile_rate_that_no_trigger_gives(press, rate):
     assert [problem for problem in problems if "sensor.rate_hz" in problem.split("=")[0]]
 
 
-@pytest.mark.parametrize("ratio", [1, 2, 3, 4, 8, 240])
+@pytest.mark.parametrize("ratio", [1, 2, 3, 240])
 def test_tactile_trigger(ratio):
     plan = canprobe.plan(change(load_scene("listen"), sensor={"rate_hz": 400 / ratio}))
     assert {pdo.transmission_type for pdo in plan.pdos} == {ratio}
@@ -399,26 +372,6 @@ class TestOtherDevices:
         left = dict(canprobe.plan(edit((r"\[6041\]", more + "[6041]"))).left_out)
         assert "has objects of more axes, from 6800h, 7000h" in left["axes 2, 3 of node 4 (joint 4)"]
 
-    def test_abilities_read_from_the_packaged_eds(self):
-        device = DeviceCapabilities.of("puma260_joint.eds", 1)
-        assert device.entry(0x6064, 0, "tpdo").signed
-        assert device.entry(0x6064, 0, "rpdo") is None, "a read-only object cannot be received"
-        assert device.entry(0x607A, 0, "rpdo").bits == 32
-        assert device.dummy(4, 32).is_dummy
-        assert device.dummy(1, 8) is None
-        assert device.pdo_numbers("rpdo") == (1, 2, 3, 4)
-        assert device.fixed_mapping("tpdo", 1)[0] == 0x60410010
-
-
-def test_plan_is_finite_everywhere(press_plan):
-    def check(value):
-        if isinstance(value, float):
-            assert math.isfinite(value)
-        for item in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
-            check(item)
-
-    check(plan_dict(press_plan))
-
 
 # --- the budget of one cycle, added up by hand: what each part waits for, in the order of the bus ------------------
 
@@ -487,8 +440,10 @@ def test_a_sensor_alone_has_a_budget_too():
     assert budget.slack_ns == 2_500_000 - 625_000 - 200_000
 
 
-@pytest.mark.parametrize("mode", ["window", "image"])
-@pytest.mark.parametrize("ids", [(17, 18, 19, 20, 21, 49, 126), (120, 121, 122, 123, 124, 125, 126)])
+@pytest.mark.parametrize(
+    ("mode", "ids"),
+    [("image", (17, 18, 19, 20, 21, 49, 126)), ("window", (120, 121, 122, 123, 124, 125, 126))],
+)
 def test_identifiers_of_the_array_leave_those_of_any_drive_alone(mode, ids, tmp_path):
     """RPDO4 of nodes 17 to 49 are 511h to 531h, where the array's are otherwise; whatever bus they are on."""
     scene = load_scene("cylinder", {"cell": "seven-axis"})
