@@ -76,6 +76,10 @@ def test_figures_and_truth_are_left_out_where_they_are_switched_off_or_nothing_i
     assert "truth.npz" not in canprobe.plan("free", {"arm.emulated": False}).outputs
 
 
+def test_a_plan_knows_about_how_many_cycles_it_takes():
+    assert canprobe.plan(load_scene("cylinder")).cycles == 23 * 400
+
+
 WITHOUT_WARNINGS = ("cylinder", "foam", "steel", "calibrate", "listen", "free", "miscalibrated")
 
 

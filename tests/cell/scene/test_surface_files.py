@@ -79,7 +79,6 @@ def test_heights_of_every_kind_of_file_are_the_same_surface(name, tmp_path):
         ("bump.csv", b"0;0,5\n0;-9999\n0;0", "1 of 6 heights are -9999: no data"),
         ("bump.csv", b"0;0,5\n0;500\n0;0", "heights rise by 500 mm over a grid 2 mm wide: .* unit_mm = 1 "),
         ("bump.csv", b"0;0,0005\n0;0\n0;0", "heights rise by 0.0005 mm over a grid 2 mm wide"),
-        ("bump.npy", b"\x93NUMPY", "bump.npy is no grid of numbers"),
         ("bump.npz", b"PK\x03\x04", "bump.npz is no grid of numbers"),
     ],
 )
@@ -294,9 +293,7 @@ def test_a_saved_scene_takes_its_heights_along(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    ("unit_mm", "size"), [(500, "20 mm by 15 mm"), (1e3 / 25.4, "narrower than 7 spacings"), (1, "0.04 mm by 0.03 mm")]
-)
+@pytest.mark.parametrize(("unit_mm", "size"), [(500, "20 mm by 15 mm"), (1e3 / 25.4, "narrower than 7 spacings")])
 def test_a_mesh_narrower_than_the_pad_is_refused_with_its_size_and_unit(unit_mm, size, tmp_path):
     mesh = dataclasses.replace(cap(tmp_path, "cap.stl"), unit_mm=unit_mm, origin_mm=None, spacing_mm=1)
     with pytest.raises(PlanError, match=r"unit_mm = .* the unit of the file") as refused:
@@ -351,10 +348,3 @@ def test_a_probe_that_leaves_a_mesh_is_stopped_and_touches_nothing_beyond(tmp_pa
     truth = read_npz(out / "truth.npz")
     points = truth["contact_point_m"][truth["in_contact"]]
     assert points[:, 1].max() == pytest.approx(-0.1225 + 0.024 - 0.0184, abs=1e-6)  # the border
-
-
-def test_a_path_that_leaves_the_surface_is_refused():
-    scene = load_scene("relief")
-    long = dataclasses.replace(scene, task=dataclasses.replace(scene.task, length_mm=120.0))
-    with pytest.raises(PlanError, match="the path leaves the object"):
-        canprobe.plan(long)
