@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from puma_arm import BODIES, ELBOW_FORM, UPENN
+from puma_arm import BODIES, ELBOW_FORM, POINT, TOOL, UPENN, pressing
 from scipy.integrate import solve_ivp
 
 from canprobe.cell.plant.config import PlantConfig
@@ -17,7 +17,7 @@ from canprobe.cell.plant.plant import Plant
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import Chain, forward, forward_jacobian
-from canprobe.mechanics.robot.denavit_hartenberg import from_dh, tool_z_offset
+from canprobe.mechanics.robot.denavit_hartenberg import from_dh
 from canprobe.mechanics.robot.model import (
     ArmModel,
     Body,
@@ -26,20 +26,16 @@ from canprobe.mechanics.robot.model import (
     units_per_motor,
     units_to_joints,
 )
-from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
 
 CYCLE = 2_500_000
-POINT, TOOL = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0)
 POSE = np.eye(4)
 POSE[:3, 3] = POINT
 CYLINDER = make_object("cylinder", T_base_object=POSE, radius=0.036)
 
 
 def config(depth=0.43e-3, shape=CYLINDER, **dynamics):
-    q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
-    settings = Dynamics(**dynamics)
-    return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, bodies=BODIES["puma260"])
+    return pressing(shape, depth, fidelity="dynamic", dynamics=Dynamics(**dynamics))
 
 
 def without_friction(c):

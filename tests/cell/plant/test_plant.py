@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from puma_arm import BODIES, ELBOW_FORM, UPENN
+from puma_arm import BODIES, ELBOW_FORM, POINT, TOOL, UPENN, pressing
 from scipy.spatial.transform import Rotation
 
 from canprobe.cell.plant.config import PlantConfig, PressMotion
@@ -14,18 +14,14 @@ from canprobe.cell.plant.pressure import pad_direction
 from canprobe.cell.plant.taxels import IDEAL_TAXELS
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
-from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.model import joints_per_motor, joints_to_units, units_per_motor, units_to_joints
-from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.touch.shapes import LIP_M
 
 PITCH_M = 1.5875e-3
 MS = 1_000_000
 CYCLE = 2_500_000
-POINT = np.array((-0.120, -0.1225, 0.374))
-TOOL = tool_z_offset(80.0)
 SHAPES = {
     "plane": {},
     "cylinder": {"radius": 0.036},
@@ -43,8 +39,7 @@ def placed(kind, yaw_deg=-48.81, tilt_deg=0.0):
 
 def plant(kind="cylinder", *, depth=0.4e-3, tilt_deg=0.0, **settings):
     shape = placed(kind, tilt_deg=tilt_deg)
-    q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
-    return Plant(PlantConfig(UPENN, q0, object=shape, **settings))
+    return Plant(pressing(shape, depth, **settings))
 
 
 def posture_of(T_base_probe):

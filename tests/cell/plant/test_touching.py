@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from puma_arm import BODIES, ELBOW_FORM, UPENN
+from puma_arm import ELBOW_FORM, POINT, TOOL, UPENN, pressing
 
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.elastic_contact import elastic_contact, force_laws, total_force
@@ -17,14 +17,12 @@ from canprobe.cell.plant.taxels import IDEAL_TAXELS
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.fieldbus.protocol.tactile import MAX_SIDE
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
-from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.model import joints_per_motor, joints_to_units
 from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.touch.shapes import LIP_M
 
 K, R = 1.27e8, 0.040
-POINT, TOOL = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0)
 POSE = np.eye(4)
 POSE[:3, 3] = POINT
 OBJECTS = {
@@ -77,9 +75,7 @@ def test_pieces_of_a_lip_add_up_to_the_law_of_a_point():
 
 
 def arm_over(shape, depth=2e-4, *, friction=0.0, point=POINT, **config):
-    q0 = start_posture(UPENN, point, (0, 0, 1), ELBOW_FORM, radius_m=R, T_flange_probe=TOOL, clearance_m=-depth)
-    settings, bodies = Dynamics(friction=friction), BODIES["puma260"]
-    return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, bodies=bodies, **config)
+    return pressing(shape, depth, point, fidelity="dynamic", dynamics=Dynamics(friction=friction), **config)
 
 
 def equations_of(config, held=False):
