@@ -25,11 +25,7 @@ from canprobe.mechanics.touch.shapes import LIP_M
 K, R = 1.27e8, 0.040
 POSE = np.eye(4)
 POSE[:3, 3] = POINT
-OBJECTS = {
-    "cylinder": {"radius": 0.036},
-    "saddle": {"radius_x": 0.06, "radius_y": -0.08},
-    "torus": {"ring_radius": 0.09, "radius": 0.03},
-}
+OBJECTS = {"cylinder": {"radius": 0.036}, "saddle": {"radius_x": 0.06, "radius_y": -0.08}}
 
 
 def ring_energy(shape, p):

@@ -199,14 +199,6 @@ def test_packaged_scenes_survive_the_way_back_and_carry_the_limits_of_hardware(n
     assert scene.limits.late_cycles_max_percent == 10
 
 
-def test_default_scene_is_the_papers_experiment():
-    scene = load_scene("cylinder")
-    assert (scene.cycle.rate_hz, scene.sensor.rate_hz) == (400, 200)
-    assert (scene.task.speed_mm_s, scene.task.force_n, scene.probe.radius_mm) == (25, 2, 40)
-    assert (scene.object.kind, scene.object.radius_mm) == ("cylinder", 36)
-    assert scene.task.duration_s >= 20
-
-
 @settings(max_examples=10)
 @given(title=st.text(), seed=st.integers(0, 2**63 - 1), force=st.floats(0.001, 4.9), x=st.floats(-1e3, 1e3))
 def test_any_values_survive_the_way_back(title, seed, force, x):
@@ -220,17 +212,6 @@ def test_any_values_survive_the_way_back(title, seed, force, x):
 
 def _class_of(hint):
     return next(iter(typing.get_args(hint)), hint)
-
-
-def test_every_field_can_be_left_out_or_says_that_it_cannot():
-    required = {
-        (section, field.name)
-        for section, hint in typing.get_type_hints(Scene).items()
-        if section != "postures"  # its keys are names
-        for field in dataclasses.fields(typing.get_args(hint)[-1] if section == "joints" else _class_of(hint))
-        if field.default is dataclasses.MISSING
-    }
-    assert required == {("scene", "name"), ("task", "kind"), ("object", "kind")}
 
 
 def test_defaults_pass_their_own_checks():

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scenes import change
 
-from canprobe.cell.scene.load import load_scene, packaged, packaged_files, parse_scene
+from canprobe.cell.scene.load import load_scene, packaged_files, parse_scene
 from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.scene.setup import Calibrate, Free, Listen, Touch
+from canprobe.cell.scene.setup import Touch
 from canprobe.errors import PlanError, SceneError
 
 
@@ -39,17 +39,6 @@ def test_millimetres_degrees_and_kilopascals_become_si():
     assert setup.limits.joint_margin == pytest.approx(math.radians(2.0))
     np.testing.assert_allclose(setup.limits.workspace, ((-0.2, -0.2, 0.3), (math.inf,) * 3))
     assert setup.compute_ns == 150_000
-
-
-@pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
-def test_a_task_holds_the_hardware_of_its_setup(name):
-    setup = resolve(load_scene(name))
-    for part in ("arm", "array", "probe"):
-        if hasattr(setup.task, part):
-            assert getattr(setup.task, part) is getattr(setup, part)
-    kinds = {"scan": Touch, "press": Touch, "calibrate": Calibrate, "listen": Listen, "free": Free}
-    assert type(setup.task) is kinds[setup.kind]
-    assert setup.emulates == bool(setup.scene.emulated_node_ids)
 
 
 def test_what_is_no_object():
