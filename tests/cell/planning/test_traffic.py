@@ -1,12 +1,11 @@
 """The bus part of a plan against the budget table of the cell, and what does not fit."""
 
 import dataclasses
-import importlib.resources
 import re
 
 import pytest
 from makes import write_eds
-from scenes import change, reasons, refused, ways_out, with_joints, without_torque
+from scenes import change, reasons, refused, ways_out, with_eds, with_joints, without_torque
 
 import canprobe
 from canprobe.cell.planning.identifiers import identifier_problems
@@ -263,106 +262,105 @@ def test_restricted_and_duplicate_identifiers(pdos, count):
     assert len(identifier_problems(pdos)) == count
 
 
-class TestOtherDevices:
-    """The plan works from what an EDS really offers."""
+# --- other devices: the plan works from what an EDS really offers --------------------------------------------------
 
-    @pytest.fixture
-    def edit(self, tmp_path):
-        def edit(*replacements):
-            text = (importlib.resources.files("canprobe.fieldbus.eds") / "puma260_joint.eds").read_text()
-            for pattern, new in replacements:
-                text, count = re.subn(pattern, new, text, flags=re.DOTALL)
-                assert count, pattern
-            path = tmp_path / "other.eds"
-            path.write_text(text)
-            return change(load_scene("free"), arm={"eds": str(path)})
 
-        return edit
+def edited(folder, *edits):
+    return with_eds(load_scene("free"), folder, *edits)
 
-    def test_unknown_eds(self):
-        assert "no such packaged file" in reasons(change(load_scene("free"), arm={"eds": "puma261_joint.eds"}))[0]
 
-    def test_without_dummies_targets_stay_single_and_it_says_so(self, edit):
-        scene = change(edit((r"Dummy0004=1", "Dummy0004=0")), arm={"grouped_rpdo": True})
-        plan = canprobe.plan(scene)
-        assert {pdo.number for pdo in plan.pdos} == {1}
-        ((what, why),) = plan.not_available
-        assert what == "two targets in one RPDO"
-        assert "0004h" in why
+def test_unknown_eds():
+    assert "no such packaged file" in reasons(change(load_scene("free"), arm={"eds": "puma261_joint.eds"}))[0]
 
-    @pytest.mark.parametrize(
-        ("fixed", "why"),
-        [(False, ": 6077h is not mappable to a TPDO"), (True, ": TPDO1 has the fixed mapping 60410010h, 60640020h")],
+
+def test_without_dummies_targets_stay_single_and_it_says_so(tmp_path):
+    scene = change(edited(tmp_path, (r"Dummy0004=1", "Dummy0004=0")), arm={"grouped_rpdo": True})
+    plan = canprobe.plan(scene)
+    assert {pdo.number for pdo in plan.pdos} == {1}
+    ((what, why),) = plan.not_available
+    assert what == "two targets in one RPDO"
+    assert "0004h" in why
+
+
+@pytest.mark.parametrize(
+    ("fixed", "why"),
+    [(False, ": 6077h is not mappable to a TPDO"), (True, ": TPDO1 has the fixed mapping 60410010h, 60640020h")],
+)
+def test_torque_that_cannot_be_mapped_is_left_away_and_it_says_so(tmp_path, fixed, why):
+    plan = canprobe.plan(without_torque(load_scene("free"), tmp_path, fixed=fixed))
+    assert [e.index for e in plan.pdos_of(1, "tpdo")[0].entries] == [0x6041, 0x6064]
+    assert plan.not_available == (("motor torque (torque_permille of log.npz)", f"{plan.nodes[0].eds}{why}"),)
+
+
+def test_each_drive_is_planned_by_its_own_eds(tmp_path):
+    """Makes may be mixed in one arm: a drive without torque, and without dummies, leaves the others as they are."""
+    plain = load_scene("free")
+    scene = edited(tmp_path, (r"(\[6077\][^\[]*PDOMapping=)1", r"\g<1>0"), (r"Dummy0004=1", "Dummy0004=0"))
+    setup = resolve(plain)
+    drives = list(setup.arm.drives)
+    drives[2] = dataclasses.replace(drives[2], eds=scene.arm.eds)
+    plan = make_plan(setup.changed("arm", drives=tuple(drives), grouped=True))
+    assert [node.eds == scene.arm.eds for node in plan.nodes] == [False, False, True, False, False, False]
+    assert [len(plan.pdos_of(n, "tpdo")[0].entries) for n in plan.node_ids] == [3, 3, 2, 3, 3, 3]
+    assert {pdo.number for pdo in plan.pdos} == {1}
+    assert [why.startswith(scene.arm.eds) for _, why in plan.not_available] == [True, True]
+
+
+def test_target_that_cannot_be_mapped_is_refused(tmp_path):
+    problems = reasons(edited(tmp_path, (r"(\[607A\][^\[]*PDOMapping=)1", r"\g<1>0")))
+    assert any("607Ah:00 is not mappable to a RPDO" in problem for problem in problems)
+
+
+def test_missing_objects_are_named(tmp_path):
+    no_60c2 = (r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")
+    problems = reasons(edited(tmp_path, *no_60c2, (r"\[1006\]", "[5FFE]"), (r"=0x1006", "=0x5FFE")))
+    said = "objects 60C2h (interpolation time period) and 1006h (period of SYNC) are missing"
+    assert any(said in problem for problem in problems)
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        (r"AccessType=ro", "(other.eds: 1006h is ro, 0 µs); no period suits all drives"),
+        (r"AccessType=ro\nDefaultValue=2500", None),
+        (r"AccessType=ro\nDefaultValue=4000", "1006h is ro, 4000 µs); take 250 Hz"),
+        (r"LowLimit=4000", "1006h takes 4000 to 4294967295 µs); take 250 Hz"),
+    ],
+)
+def test_a_drive_without_60c2h_takes_the_period_that_1006h_takes(tmp_path, keys, said):
+    """Of two equal keys in a section the first counts."""
+    no_60c2 = (r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")
+    scene = edited(tmp_path, *no_60c2, (r"\[1006\]", rf"[1006]\n{keys}"))
+    if said is None:
+        assert canprobe.plan(scene)
+    else:
+        assert any(said in problem.replace(f"{scene.arm.eds}", "other.eds") for problem in reasons(scene))
+
+
+@pytest.mark.parametrize(
+    ("sub", "keys", "said"),
+    [
+        (
+            1,
+            r"AccessType=ro\nDefaultValue=",
+            "60C2h:01 takes no value by the EDS: no integer, read-only without a default",
+        ),
+        (1, r"DataType=0x9", "60C2h:01 takes no value by the EDS"),
+        (2, r"AccessType=ro\nDefaultValue=3", "60C2h:02 takes no unit of 10^-6 to 10^0 s by the EDS"),
+    ],
+)
+def test_an_interpolation_time_that_nothing_fits_is_said_without_a_hole(tmp_path, sub, keys, said):
+    problems = reasons(edited(tmp_path, (rf"\[60C2sub{sub}\]", rf"[60C2sub{sub}]\n{keys}")))
+    assert any(said in problem for problem in problems)
+
+
+def test_axes_beyond_the_first_are_left_out_and_named(tmp_path):
+    more = "".join(
+        f"[{index:X}]\nParameterName=Controlword\nObjectType=7\nDataType=6\nAccessType=rw\n\n"
+        for index in (0x6840, 0x7040)
     )
-    def test_torque_that_cannot_be_mapped_is_left_away_and_it_says_so(self, tmp_path, fixed, why):
-        plan = canprobe.plan(without_torque(load_scene("free"), tmp_path, fixed=fixed))
-        assert [e.index for e in plan.pdos_of(1, "tpdo")[0].entries] == [0x6041, 0x6064]
-        assert plan.not_available == (("motor torque (torque_permille of log.npz)", f"{plan.nodes[0].eds}{why}"),)
-
-    def test_each_drive_is_planned_by_its_own_eds(self, edit):
-        """Makes may be mixed in one arm: a drive without torque, and without dummies, leaves the others as they are."""
-        plain = load_scene("free")
-        scene = edit((r"(\[6077\][^\[]*PDOMapping=)1", r"\g<1>0"), (r"Dummy0004=1", "Dummy0004=0"))
-        setup = resolve(plain)
-        drives = list(setup.arm.drives)
-        drives[2] = dataclasses.replace(drives[2], eds=scene.arm.eds)
-        plan = make_plan(setup.changed("arm", drives=tuple(drives), grouped=True))
-        assert [node.eds == scene.arm.eds for node in plan.nodes] == [False, False, True, False, False, False]
-        assert [len(plan.pdos_of(n, "tpdo")[0].entries) for n in plan.node_ids] == [3, 3, 2, 3, 3, 3]
-        assert {pdo.number for pdo in plan.pdos} == {1}
-        assert [why.startswith(scene.arm.eds) for _, why in plan.not_available] == [True, True]
-
-    def test_target_that_cannot_be_mapped_is_refused(self, edit):
-        problems = reasons(edit((r"(\[607A\][^\[]*PDOMapping=)1", r"\g<1>0")))
-        assert any("607Ah:00 is not mappable to a RPDO" in problem for problem in problems)
-
-    def test_missing_objects_are_named(self, edit):
-        no_60c2 = (r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")
-        problems = reasons(edit(*no_60c2, (r"\[1006\]", "[5FFE]"), (r"=0x1006", "=0x5FFE")))
-        said = "objects 60C2h (interpolation time period) and 1006h (period of SYNC) are missing"
-        assert any(said in problem for problem in problems)
-
-    @pytest.mark.parametrize(
-        ("keys", "said"),
-        [
-            (r"AccessType=ro", "(other.eds: 1006h is ro, 0 µs); no period suits all drives"),
-            (r"AccessType=ro\nDefaultValue=2500", None),
-            (r"AccessType=ro\nDefaultValue=4000", "1006h is ro, 4000 µs); take 250 Hz"),
-            (r"LowLimit=4000", "1006h takes 4000 to 4294967295 µs); take 250 Hz"),
-        ],
-    )
-    def test_a_drive_without_60c2h_takes_the_period_that_1006h_takes(self, edit, keys, said):
-        """Of two equal keys in a section the first counts."""
-        no_60c2 = (r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")
-        scene = edit(*no_60c2, (r"\[1006\]", rf"[1006]\n{keys}"))
-        if said is None:
-            assert canprobe.plan(scene)
-        else:
-            assert any(said in problem.replace(f"{scene.arm.eds}", "other.eds") for problem in reasons(scene))
-
-    @pytest.mark.parametrize(
-        ("sub", "keys", "said"),
-        [
-            (
-                1,
-                r"AccessType=ro\nDefaultValue=",
-                "60C2h:01 takes no value by the EDS: no integer, read-only without a default",
-            ),
-            (1, r"DataType=0x9", "60C2h:01 takes no value by the EDS"),
-            (2, r"AccessType=ro\nDefaultValue=3", "60C2h:02 takes no unit of 10^-6 to 10^0 s by the EDS"),
-        ],
-    )
-    def test_an_interpolation_time_that_nothing_fits_is_said_without_a_hole(self, edit, sub, keys, said):
-        problems = reasons(edit((rf"\[60C2sub{sub}\]", rf"[60C2sub{sub}]\n{keys}")))
-        assert any(said in problem for problem in problems)
-
-    def test_axes_beyond_the_first_are_left_out_and_named(self, edit):
-        more = "".join(
-            f"[{index:X}]\nParameterName=Controlword\nObjectType=7\nDataType=6\nAccessType=rw\n\n"
-            for index in (0x6840, 0x7040)
-        )
-        left = dict(canprobe.plan(edit((r"\[6041\]", more + "[6041]"))).left_out)
-        assert "has objects of more axes, from 6800h, 7000h" in left["axes 2, 3 of node 4 (joint 4)"]
+    left = dict(canprobe.plan(edited(tmp_path, (r"\[6041\]", more + "[6041]"))).left_out)
+    assert "has objects of more axes, from 6800h, 7000h" in left["axes 2, 3 of node 4 (joint 4)"]
 
 
 # --- the budget of one cycle, added up by hand: what each part waits for, in the order of the bus ------------------
