@@ -209,14 +209,17 @@ def test_a_grid_without_spacing_and_an_archive_without_heights(tmp_path):
         true_object(dataclasses.replace(settings, file=str(tmp_path / "other.npz")))
 
 
+def facets(rows, columns):
+    """Facets (n, 3) between the vertices of a grid, which go along its rows."""
+    corner = np.array([columns * i + j for i in range(rows - 1) for j in range(columns - 1)])[:, None]
+    return np.concatenate((corner + np.array((0, columns, 1)), corner + np.array((1, columns, columns + 1))))
+
+
 def cap(folder, name, *, inside_out=False):
     """A cap of a ball of 50 mm in metres, its top at x = 10 mm, y = 5 mm, as a file of facets."""
     trimesh = pytest.importorskip("trimesh")
-    x, y = np.meshgrid(np.arange(-20, 20.1), np.arange(-15, 15.1), indexing="ij")
-    vertices = 1e-3 * np.column_stack([(x + 10).ravel(), (y + 5).ravel(), np.sqrt(2500 - x**2 - y**2).ravel()])
-    index = np.arange(x.size).reshape(x.shape)
-    a, b, c, d = (one.ravel() for one in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]))
-    faces = np.concatenate((np.column_stack((a, b, d)), np.column_stack((a, d, c))))
+    vertices = 1e-3 * np.column_stack([(X + 10).ravel(), (Y + 5).ravel(), np.sqrt(2500 - X**2 - Y**2).ravel()])
+    faces = facets(*X.shape)
     mesh = trimesh.Trimesh(vertices, faces[:, ::-1] if inside_out else faces, process=False)
     mesh.export(folder / name)
     return ObjectSettings("mesh", file=str(folder / name), unit_mm=1000, spacing_mm=2, origin_mm=(10, 5))
@@ -237,8 +240,7 @@ def test_the_plan_says_what_was_put_in_order_in_a_mesh_and_the_spacing_that_help
     trimesh = pytest.importorskip("trimesh")
     scene = dome(tmp_path, True)
     x, y = (one.ravel() for one in np.meshgrid(*[np.linspace(-24, 24, 13)] * 2, indexing="ij"))
-    corner = np.array([13 * i + j for i in range(12) for j in range(12)])[:, None]
-    faces = np.concatenate((corner + np.array((0, 13, 1)), corner + np.array((1, 13, 14))))
+    faces = facets(13, 13)
     faces[[30, 100]] = faces[[30, 100], ::-1]
     apart = np.column_stack((x, y, 30 - (x * x + y * y) / 80))[faces].reshape(-1, 3)
     apart += np.random.default_rng(0).uniform(-1e-5, 1e-5, apart.shape)
@@ -313,8 +315,7 @@ def dome(folder, whole):
     """A shallow dome of 48 mm by 48 mm, or the disc in it, as a scene for the relief's path."""
     trimesh = pytest.importorskip("trimesh")
     x, y = (one.ravel() for one in np.meshgrid(*[np.linspace(-24, 24, 49)] * 2, indexing="ij"))
-    corner = np.array([49 * i + j for i in range(48) for j in range(48)])[:, None]
-    faces = np.concatenate((corner + np.array((0, 49, 1)), corner + np.array((1, 49, 50))))
+    faces = facets(49, 49)
     faces = faces[(whole | (np.hypot(x, y) <= 24))[faces].all(axis=1)]
     trimesh.Trimesh(np.column_stack((x, y, -(x * x + y * y) / 400)), faces, process=False).export(folder / "dome.stl")
     text = (scenes_folder() / "relief.toml").read_text().replace("width_mm = 6", "width_mm = 2")
