@@ -1,7 +1,6 @@
-"""Forces of one and of several touches: slopes of their energy, pushes on the arm, energy in closed cycles."""
+"""Forces of one and of several touches: slopes of their energy, and their push on the arm by finite differences."""
 
 import math
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,7 +10,6 @@ from puma_arm import ELBOW_FORM, POINT, TOOL, UPENN, pressing
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.elastic_contact import elastic_contact, force_laws, total_force
 from canprobe.cell.plant.equations import ArmEquations
-from canprobe.cell.plant.integrators import rosenbrock2
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.plant.taxels import IDEAL_TAXELS
 from canprobe.cell.scene.setup import Dynamics
@@ -41,9 +39,8 @@ RESTS_AT = 0.03 + math.sqrt((R + LIP_M) ** 2 - (0.03 + LIP_M) ** 2)
 @pytest.mark.parametrize("aside", [(0.0, 0.0), (4e-4, 2e-4)])
 def test_the_lips_force_is_the_slope_of_its_energy(aside):
     centre = POINT + np.array((*aside, RESTS_AT - 3e-4))
-    zero = np.zeros(360)
     found = TIGHT_BOWL.touches(centre, R)
-    force = total_force(found, R, K, zero[: len(found.points)], 0.0)
+    force = total_force(found, R, K, np.zeros(len(found.points)), 0.0)
     h = 1e-8
     slope = [
         (ring_energy(TIGHT_BOWL, centre + d) - ring_energy(TIGHT_BOWL, centre - d)) / (2 * h) for d in h * np.eye(3)
@@ -72,53 +69,6 @@ def test_pieces_of_a_lip_add_up_to_the_law_of_a_point():
 
 def arm_over(shape, depth=2e-4, *, friction=0.0, point=POINT, **config):
     return pressing(shape, depth, point, fidelity="dynamic", dynamics=Dynamics(friction=friction), **config)
-
-
-def equations_of(config, held=False):
-    """Equations of an arm without weight, friction of its own and drives."""
-    joints = tuple(replace(joint, coulomb=0.0, viscous=0.0) for joint in config.model.joints)
-    found = ArmEquations(replace(config, model=replace(config.model, joints=joints)), held=held)
-    found.body._model.opt.gravity[:] = 0.0
-    found.loops.gain, found.loops.integral, found.loops.unwind = np.zeros(6), np.zeros(6), 0.0
-    return found
-
-
-def bounced(config, steps=700, h=4e-4, speed=0.05):
-    """A free arm thrown at the object: kinetic energy before, and after it has left again."""
-    e = equations_of(config)
-    theta = joints_to_units(UPENN, config.q0) / np.diag(UPENN.units_per_q)
-    e.hold(e.resting(theta))
-    away = e.contact.rows[0].mean(axis=0)
-    v = -e.inverse @ away
-    v *= speed / abs(float(away @ v))
-    y = np.concatenate((theta, v, np.zeros(6)))
-
-    def kinetic(y):
-        e.hold(y)
-        return 0.5 * float(y[6:12] @ e.mass @ y[6:12])
-
-    before, deepest = kinetic(y), 0.0
-    for i in range(steps):
-        y = rosenbrock2(e, i * h, y, h)
-        e.hold(y)
-        push = e.contact.push(y[:6], y[6:12]) if e.contact is not None else None
-        deepest = max(deepest, 0.0 if push is None else float(np.abs(push).max()))
-        if push is None and i > 20:
-            break
-    assert deepest > 0.0
-    assert push is None, "it has not left the object again"
-    return before, kinetic(y)
-
-
-@pytest.mark.parametrize("kind", [*OBJECTS, "tight bowl"])
-def test_a_bounce_creates_no_energy_and_without_damping_loses_none(kind):
-    shape, point = TIGHT_BOWL, POINT + np.array((0.0, 0.0, RESTS_AT - R))
-    if kind in OBJECTS:
-        shape, point = make_object(kind, T_base_object=POSE, **OBJECTS[kind]), POINT
-    before, after = bounced(arm_over(shape, depth=0.0, point=point, damping_s_m=0.0))
-    assert after == pytest.approx(before, rel=5e-3)
-    before, after = bounced(arm_over(shape, depth=0.0, point=point, damping_s_m=5.0))
-    assert 0.5 * before < after < 0.97 * before
 
 
 def places(shape, centre):
