@@ -246,7 +246,7 @@ def test_slopes_are_those_of_the_equations_and_the_shifted_solver_solves(made):
     n, e = model.n, ArmEquations(on_a_plane(made))
     y = e.resting(np.linalg.solve(joints_per_motor(model), q0))
     y[n : 2 * n] = 1e-3 * (1.0 + np.arange(n))
-    y[2 * n] += 1e4  # one motor at its limit
+    y[2 * n] += 3.0 * e.loops.limit[0]  # one motor at its limit
     e.hold(y)
     e.loops.set_reference(0.0, y[:n] + 1e-4, np.full(n, 0.1))
     J = e.jacobian(0.0, y)
