@@ -120,6 +120,12 @@ def test_halves_joined_are_the_whole():
     assert apart.tensor == pytest.approx(np.diag((0.0, 0.12, 0.12)))
 
 
+def test_without_mujoco_it_is_said_what_to_type(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(PlanError, match=r"pip install .*\[dynamics\]"):
+        RigidBody(UPENN.chain, BODIES["puma260"])
+
+
 def test_dynamics_of_moments_that_no_body_has_are_refused_and_an_ideal_arm_does_not_ask_for_them():
     bodies = [
         Body(1.0, np.zeros(3), np.diag(moments)) for moments in ((1.0, 1.0, 1.9), (1.0, 1.0, 9.0), (0.0, 0.0, 9.0))
