@@ -31,19 +31,22 @@ def with_joints(scene: Scene, /, **keys: Sequence[Any]) -> Scene:
     return dataclasses.replace(scene, joints=joints)
 
 
-def without_torque(scene: Scene, folder: Path, *, fixed: bool) -> Scene:
-    """A scene with drives whose TPDO cannot carry 6077h: its mapping is fixed, or the object cannot be mapped."""
-    edits = [(r"(\[6077\][^\[]*PDOMapping=)1", "0")]
-    if fixed:
-        count = r"(\[1A00sub0\][^\[]*"
-        edits = [(count + "AccessType=)rw", "ro"), (count + "DefaultValue=)3", "2")]
+def with_eds(scene: Scene, folder: Path, *edits: tuple[str, str]) -> Scene:
+    """A scene whose drives have the packaged EDS with patterns replaced."""
     text = eds_path("puma260_joint").read_text(encoding="ascii")
-    for pattern, value in edits:
-        text, found = re.subn(pattern, rf"\g<1>{value}", text)
-        assert found == 1, pattern
-    path = folder / "without_torque.eds"
+    for pattern, new in edits:
+        text, found = re.subn(pattern, new, text, flags=re.DOTALL)
+        assert found, pattern
+    path = folder / "other.eds"
     path.write_text(text, encoding="ascii")
     return change(scene, arm={"eds": str(path)})
+
+
+def without_torque(scene: Scene, folder: Path, *, fixed: bool) -> Scene:
+    """A scene with drives whose TPDO cannot carry 6077h: its mapping is fixed, or the object cannot be mapped."""
+    count = r"(\[1A00sub0\][^\[]*"
+    edits = [(count + "AccessType=)rw", r"\g<1>ro"), (count + "DefaultValue=)3", r"\g<1>2")]
+    return with_eds(scene, folder, *(edits if fixed else [(r"(\[6077\][^\[]*PDOMapping=)1", r"\g<1>0")]))
 
 
 def refused(scene: Scene) -> PlanError:

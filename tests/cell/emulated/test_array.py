@@ -84,32 +84,6 @@ def spot(row, column, value=100):
     return image
 
 
-def test_sensor_61_whole_frame_at_every_second_sync_header_first(make):
-    sensor = make().go()
-    assert [sensor.sync() is not None for _ in range(6)] == [False, True] * 3
-    ids = [can_id for can_id, _ in sensor.bench.send(0x80, "07", 7 * CYCLE) + sensor.bench.send(0x80, "08", 8 * CYCLE)]
-    assert ids == list(range(0x511, 0x51A))
-
-
-@pytest.mark.parametrize("mode", list(TactileMode))
-def test_sensor_61_every_mode_comes_whole(make, plant, mode):
-    plant.image = np.arange(256, dtype=np.uint8).reshape(16, 16)
-    sensor = make(mode=mode).go()
-    first = sensor.frames(2)[0]
-    assert (first.header.mode, sensor.assembler.torn, sensor.assembler.crc_errors) == (mode, 0, 0)
-    if mode is TactileMode.IMAGE:
-        assert np.array_equal(first.taxels, plant.image)
-    elif mode is TactileMode.WINDOW:
-        r, c, rows, columns = first.window
-        assert np.array_equal(first.taxels[r : r + rows, c : c + columns], plant.image[r : r + rows, c : c + columns])
-
-
-def test_sensor_61_one_sampling_instant_a_frame(make, plant):
-    sensor = make(mode=TactileMode.IMAGE).go(t_ns=100)
-    sensor.frames(2)
-    assert plant.sampled == [100, 2 * CYCLE, 4 * CYCLE]
-
-
 def test_sensor_the_frame_shows_the_trigger_before_and_its_age(make, plant):
     plant.image = spot(4, 4, 10)
     sensor = make(mode=TactileMode.IMAGE).go(t_ns=1 * MS)
@@ -155,17 +129,6 @@ def test_sensor_62_counter_counts_frames_mod_256(make):
     assert sensor.assembler.lost == 0
 
 
-@pytest.mark.parametrize(
-    ("row", "column", "origin"),
-    [(7, 8, (4, 4)), (0, 0, (0, 0)), (15, 15, (8, 8)), (3, 12, (0, 8)), (10, 5, (6, 2)), (12, 2, (8, 0))],
-)
-def test_sensor_63_window_follows_the_contact(make, plant, row, column, origin):
-    plant.image = spot(row, column)
-    frame = make().go().frames(1)[0]
-    assert (frame.header.origin_row, frame.header.origin_col) == origin
-    assert frame.taxels[row, column] == 100
-
-
 def test_sensor_63_window_stays_without_contact_and_does_not_flicker(make, plant):
     plant.image = spot(12, 12)
     sensor = make().go()
@@ -178,15 +141,6 @@ def test_sensor_63_window_stays_without_contact_and_does_not_flicker(make, plant
         plant.image[8, 7 if turn % 2 else 9] = 10
         origins.add(sensor.frames(1)[0].window[:2])
     assert len(origins) <= 2  # the way there, and then one place
-
-
-def test_sensor_rows_are_rows(make, plant):
-    plant.image = spot(9, 6, 77)
-    sensor = make().go()
-    sensor.frames(1)
-    frames = dict(sensor.bench.send(0x80, "03", 3 * CYCLE) + sensor.bench.send(0x80, "04", 4 * CYCLE))
-    r, c = sensor.bench.read(0x2006) >> 4, sensor.bench.read(0x2006) & 15
-    assert bytes.fromhex(frames[0x512 + 9 - r])[6 - c] == 77
 
 
 def test_sensor_64_threshold_and_gain(make, plant):
@@ -256,11 +210,6 @@ def test_sensor_is_silent_out_of_operational_and_starts_afresh(make, plant):
     assert (frame.taxels[2, 2], frame.taxels[1, 1]) == (100, 0)
 
 
-def test_a_tactile_node_boots(plant):
-    node = SlaveNode(load_eds("tactile_array", 16), 16, TactileApplication(plant))
-    assert node.start(0) == [(0x710, b"\0")]
-
-
 # Object 2008h of the tactile node: which windows it takes, when, and what it then sends.
 
 SIZE = 0x2008
@@ -274,14 +223,6 @@ def sensor(bench, plant):
     for order in ((0x1019, 0, 240, 1), (0x2001, 0, 0, 1)):
         assert found.write(*order) == 0
     return found
-
-
-def map_window(sensor, words):
-    """Header and window PDOs on every SYNC."""
-    for number in range(33):
-        assert sensor.write(0x1800 + number, 1, OFF | 0x511 + number, 4) == 0
-    for number, word in enumerate([0x21200040, *(0x21100040 | sub << 8 for sub in range(1, words + 1))]):
-        sensor.configure(0x1800 + number, cob_id=0x511 + number, words=[word], type=1)
 
 
 @pytest.mark.parametrize("value, abort", [(3, 0x06090032), (13, 0x06090031), (5, 0x06090030), (11, 0x06090030)])
@@ -306,7 +247,10 @@ def test_the_window_holds_the_contact_wherever_it_is(sensor, plant, side, spot):
     plant.image = np.zeros((16, 16), np.uint8)
     plant.image[spot] = 99
     assert sensor.write(SIZE, 0, side, 1) == 0
-    map_window(sensor, window_words(side))
+    for number in range(33):
+        assert sensor.write(0x1800 + number, 1, OFF | 0x511 + number, 4) == 0
+    for number, word in enumerate([0x21200040, *(0x21100040 | sub << 8 for sub in range(1, window_words(side) + 1))]):
+        sensor.configure(0x1800 + number, cob_id=0x511 + number, words=[word], type=1)
     sensor.nmt(0x01)
     assembler = FrameAssembler(range(0x511, 0x512 + window_words(side)), TactileMode.WINDOW, CYCLE, window=side)
     frames = sensor.send(0x80, "01", CYCLE)
@@ -314,6 +258,7 @@ def test_the_window_holds_the_contact_wherever_it_is(sensor, plant, side, spot):
     assert found[-1] is not None and found[-1].header.window == side
     assert np.array_equal(decode(found[-1], (16, 16)).taxels, plant.image)
     row, column = found[-1].header.origin_row, found[-1].header.origin_col
+    assert sensor.read(0x2006) == row << 4 | column
     ideal = [min(max(at - (side - 1) / 2, 0), 16 - side) for at in spot]
     assert abs(row - ideal[0]) <= 0.75 and abs(column - ideal[1]) <= 0.75
 

@@ -99,37 +99,6 @@ def test_sensor_62_counter_and_a_torn_frame(sensor, plant):
     assert (reader.frame().header.frame_counter, reader.assembler.torn) == (4, 1)
 
 
-def test_sensor_62_taxels_of_another_frame_break_the_checksum(sensor, plant):
-    reader = Reader(sensor, TactileMode.IMAGE)
-    reader.frame()
-    header = reader.raw()[0]
-    plant.image = spot(8, 8)
-    reader.raw()
-    assert reader.push([header, *reader.raw()[1:]]) == [None] * 33
-    assert reader.assembler.crc_errors == 1
-
-
-def test_sensor_62_a_changed_taxel_breaks_the_checksum(sensor, plant):
-    plant.image = spot(8, 8)
-    reader = Reader(sensor, TactileMode.IMAGE)
-    raw = reader.raw()
-    taxels = bytearray.fromhex(raw[17].text)
-    taxels[0] ^= 1
-    raw[17] = raw[17]._replace(text=taxels.hex())
-    assert reader.push(raw) == [None] * 33
-    assert reader.assembler.crc_errors == 1
-
-
-def test_sensor_63_the_window_follows_the_contact(sensor, plant):
-    reader = Reader(sensor, TactileMode.WINDOW)
-    for row, column in ((4, 4), (11, 5), (15, 15), (0, 9)):
-        plant.image = spot(row, column)
-        frame = [reader.frame() for _ in range(3)][-1]
-        first_row, first_column, rows, columns = frame.window
-        assert first_row <= row < first_row + rows and first_column <= column < first_column + columns
-        assert frame.taxels[row, column] == 100
-
-
 @pytest.mark.parametrize("stored", [True, False])
 def test_sensor_64_tare_and_gain_over_sdo_and_stored(sensor, plant, stored):
     assert sensor.write(0x2003, 0, 1, 4) == 0x08000020

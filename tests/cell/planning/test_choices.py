@@ -6,12 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from scenes import change, refused
+from scenes import change, refused, ways_out
 
 import canprobe
 from canprobe.cell.planning.array import cut_patch, measured_share, patch_radius_m, true_force_n
 from canprobe.cell.planning.free_parameters import opened, second_channel
-from canprobe.cell.planning.identifiers import order_by_deadline
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.report import plan_dict, plan_text
 from canprobe.cell.scene.load import dump_scene, load_scene, parse_scene
@@ -20,7 +19,6 @@ from canprobe.cli import main
 from canprobe.errors import PlanError, SceneError
 from canprobe.fieldbus.bus.real.adapters import LOCAL_GROUP
 from canprobe.fieldbus.protocol.frames import is_restricted
-from canprobe.fieldbus.protocol.response_times import Message, worst_case_response
 
 
 @pytest.fixture(scope="module")
@@ -45,30 +43,19 @@ def test_what_fits_is_left_as_the_contract_has_it(press):
     assert not canprobe.plan(press).choices
 
 
-def test_the_packaged_scenes_leave_nothing_open(press):
-    assert '"auto"' not in dump_scene(press)
-    assert canprobe.plan(press).scene == press
-
-
 def test_500_hz_needs_grouped_targets_and_priorities_by_deadline(press):
     """Neither alone is enough: the planner finds the pair, which costs no hardware."""
     scene = change(press, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
     for half in ({"arm": {"grouped_rpdo": True}}, {"bus": {"cob_ids": "by_deadline"}}):
         with pytest.raises(PlanError):
-            canprobe.plan(change(scene, **half))
+            make_plan(resolve(change(scene, **half)), find_ways=False)
+    ways = ways_out(scene)
+    assert any(way.startswith('arm.grouped_rpdo = true and bus.cob_ids = "by_deadline": load 95 %') for way in ways)
+    assert not any(way.startswith("arm.grouped_rpdo = true: ") for way in ways)  # alone it does not
     plan = opened_plan(scene)
     assert chosen(plan)["arm.grouped_rpdo"] == "true" and chosen(plan)["bus.cob_ids"] == '"by_deadline"'
     assert plan.budget.slack_ns > 0
     assert len(plan.buses) == 1
-
-
-def test_ways_out_name_changes_that_fit_only_together(press):
-    scene = change(press, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
-    with pytest.raises(PlanError) as refused:
-        canprobe.plan(scene)
-    ways = refused.value.ways_out
-    assert any(way.startswith('arm.grouped_rpdo = true and bus.cob_ids = "by_deadline": load 95 %') for way in ways)
-    assert not any(way.startswith("arm.grouped_rpdo = true: ") for way in ways)  # alone it does not
 
 
 def test_an_image_beside_the_arm_gets_a_bus_of_its_own_or_can_fd(press):
@@ -120,26 +107,6 @@ def test_priorities_follow_the_deadlines_and_are_never_restricted(press):
     }
 
 
-def test_deadline_order_fits_where_the_default_order_does_not():
-    """An urgent message below a patient one: the response-time analysis itself is the witness."""
-
-    def late(order):
-        messages = [
-            Message(name, 0x181 + rank, 8, period, deadline_ns=deadline)
-            for rank, (name, period, deadline) in enumerate(order)
-        ]
-        return [response.message.name for response in worst_case_response(messages).responses if not response.fits]
-
-    patient = [(f"patient {i}", 5_000_000, 5_000_000) for i in range(4)]
-    urgent = ("urgent", 1_000_000, 400_000)
-    assert late([*patient, urgent]) == ["urgent"] and not late([urgent, *patient])
-
-
-def test_order_by_deadline_twice_changes_nothing(press):
-    once = order_by_deadline(canprobe.plan(press).pdos)
-    assert order_by_deadline(once) == once
-
-
 @pytest.mark.parametrize(
     ("channel", "second"), [("can0", "can1"), ("vcan9", "vcan10"), ("PCAN_USBBUS1", "PCAN_USBBUS2"), ("a", "a2")]
 )
@@ -178,26 +145,20 @@ PITCH = 1.5875e-3
 PROBE = resolve(load_scene("cylinder")).probe
 
 
-@pytest.mark.parametrize("side, off", [(4, 0.0), (4, 0.75), (6, 0.0), (6, 0.75), (8, 0.75)])
-@pytest.mark.parametrize("force", [0.5, 2.0, 4.5])
+@pytest.mark.parametrize(
+    ("side", "off", "force"), [(4, 0.75, 2.0), (6, 0.0, 4.5), (8, 0.75, 0.5), (40, 20.0, 2.0), (40, 30.0, 2.0)]
+)
 def test_share_against_points_on_a_grid(side, off, force):
-    """The patch of the plant and its pressure, summed over a million points."""
+    """The patch of the plant and its pressure, summed over many points; an edge far away feels half or none."""
     radius = patch_radius_m(force, PROBE)
-    x, y = np.meshgrid(*[np.linspace(-1.0, 1.0, 1001)] * 2)
+    x, y = np.meshgrid(*[np.linspace(-1.0, 1.0, 501)] * 2)
     pressure = np.clip(1.0 - x**2 - y**2, 0.0, None)
     half, middle = side / 2 * PITCH / radius, off * PITCH / radius
     inside = pressure[(np.abs(x - middle) <= half) & (np.abs(y) <= half)].sum() / pressure.sum()
     assert measured_share(force, PROBE, side, PITCH, off) == pytest.approx(inside, abs=5e-3)
 
 
-def test_share_of_a_strip_by_hand():
-    """A window far longer than the patch whose edge runs through the middle feels half of the force."""
-    assert measured_share(2.0, PROBE, 40, PITCH, 20.0) == pytest.approx(0.5, abs=1e-6)
-    assert measured_share(2.0, PROBE, 40, PITCH, 0.0) == pytest.approx(1.0, abs=1e-4)
-    assert measured_share(2.0, PROBE, 40, PITCH, 30.0) == 0.0
-
-
-@pytest.mark.parametrize("side", [4, 6, 8])
+@pytest.mark.parametrize("side", [4, 6])
 def test_the_true_force_is_the_one_of_which_the_target_is_inside(side):
     true = true_force_n(2.0, PROBE, side, PITCH, 100.0)
     assert true * measured_share(true, PROBE, side, PITCH) == pytest.approx(2.0, rel=1e-6)
@@ -238,10 +199,7 @@ def test_features_and_the_whole_image_cut_nothing():
     [
         ("239.74.163.2", False),
         ("ff15:7079:7468:6f6e:6465:6d6f:6d63:6173", False),
-        ("ff02::1", False),
-        ("fd00::1", False),
         (LOCAL_GROUP, True),
-        ("ff01::2", True),
     ],
 )
 def test_a_bus_that_other_machines_hear_is_a_warning_with_the_way_to_restrict_it(channel, local):
@@ -277,12 +235,8 @@ def test_errors_on_the_wire_are_a_warning():
 
 @pytest.mark.parametrize(("emulated", "missed_syncs", "warned"), [(False, 10, 0), (False, 11, 1), (True, 250, 0)])
 def test_real_drives_that_wait_long_for_their_master_are_a_warning(emulated, missed_syncs, warned):
-    plan = canprobe.plan(change(load_scene("free"), arm={"emulated": emulated, "missed_syncs": missed_syncs}))
+    one = load_scene("free", {"joints.joint_3.emulated": emulated})
+    plan = canprobe.plan(change(one, arm={"missed_syncs": missed_syncs}))
     found = [one for one in plan.warnings if one.startswith(f"arm.missed_syncs = {missed_syncs}: real drives")]
     assert len(found) == warned
     assert all(f"stay enabled for {11 / plan.setup.rate_hz * 1e3:g} ms after" in warning for warning in found)
-
-
-def test_one_real_drive_is_enough_for_that_warning():
-    scene = change(load_scene("free", {"joints.joint_3.emulated": False}), arm={"missed_syncs": 40})
-    assert any("stay enabled for 100 ms after" in warning for warning in canprobe.plan(scene).warnings)

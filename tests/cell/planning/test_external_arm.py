@@ -9,8 +9,7 @@ from canprobe.lab.studies.linear_loop import ForceLoop, spectral_radius
 OMEGA, LAG_S = natural_frequency(30.0), 6.8e-3
 
 
-@pytest.mark.parametrize("rate_hz", [125.0, 500.0])
-@pytest.mark.parametrize("delay_ms", [4.0, 8.0, 16.0, 40.0])
+@pytest.mark.parametrize(("rate_hz", "delay_ms"), [(125.0, 4.0), (125.0, 40.0), (500.0, 4.0), (500.0, 40.0)])
 def test_what_the_plan_allows_settles_and_three_times_it_does_not(rate_hz, delay_ms):
     images = max(1, round(rate_hz / 250.0))
     loop_s = (2 * images + 2) / rate_hz + LAG_S + 1e-3 * delay_ms

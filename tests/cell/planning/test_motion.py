@@ -24,37 +24,43 @@ def cylinder():
     return load_scene("cylinder")
 
 
+FAR, SMALL = (-400.0, -400.0, 374.0), {"length_mm": 10.0, "width_mm": 4.0}
+
+
 @pytest.mark.parametrize(
-    "obj",
+    ("sections", "said"),
     [
-        ObjectSettings("bowl", radius_mm=40),
-        ObjectSettings("bowl", radius_mm=30),
-        ObjectSettings("saddle", radius_x_mm=60, radius_y_mm=-35),
+        (
+            {"object": {"position_mm": FAR}, "task": {"start_mm": FAR}},
+            "contact at .-4.* out of reach of the puma260 arm",
+        ),
+        ({"object": {"rotation_deg": (0, 0, -48.81)}, "task": {"heading_deg": 41.19}}, "joint 1 .*its stop, 110"),
+        ({"object": {"position_mm": (-120.0, -122.5, 384.0)}}, "10.0 mm above"),
+        ({"object": {"position_mm": (-120.0, -122.5, 362.0)}}, "12.0 mm below"),
+        ({"task": {"start_mm": (-120.0, -222.5, 374.0)}}, "does not meet the object"),
+        ({"task": {"length_mm": 80.0}}, "leaves the object"),
     ],
 )
-def test_hollow_tighter_than_the_probe_is_refused(cylinder, obj):
-    scene = dataclasses.replace(change(cylinder, task={"length_mm": 10.0, "width_mm": 4.0}), object=obj)
-    assert any("tighter than the probe of radius 40 mm" in problem for problem in reasons(scene))
+def test_a_path_that_the_arm_or_the_object_does_not_have_is_refused(cylinder, sections, said):
+    (problem,) = reasons(change(cylinder, **sections))
+    assert re.search(said, problem)
 
 
-def test_wider_hollow_and_tight_ridge_are_no_problem(cylinder):
-    small = change(cylinder, task={"length_mm": 10.0, "width_mm": 4.0})
-    assert canprobe.plan(dataclasses.replace(small, object=ObjectSettings("bowl", radius_mm=60)))
-    ridge = ObjectSettings("cylinder", radius_mm=12, rotation_deg=(0, 0, 20))
-    assert canprobe.plan(dataclasses.replace(small, object=ridge))
-
-
-def test_object_out_of_reach_names_point_and_why(cylinder):
-    far = (-400.0, -400.0, 374.0)
-    (problem,) = reasons(change(cylinder, object={"position_mm": far}, task={"start_mm": far}))
-    assert "contact at (-4" in problem
-    assert "out of reach of the puma260 arm" in problem
-
-
-def test_joint_at_its_stop_is_named(cylinder):
-    (problem,) = reasons(change(cylinder, object={"rotation_deg": (0, 0, -48.81)}, task={"heading_deg": 41.19}))
-    assert "joint 1" in problem
-    assert "110" in problem
+@pytest.mark.parametrize(
+    ("kind", "keys", "tighter"),
+    [
+        ("bowl", {"radius_mm": 40}, True),
+        ("bowl", {"radius_mm": 60}, False),
+        ("saddle", {"radius_x_mm": 60, "radius_y_mm": -35}, True),
+        ("cylinder", {"radius_mm": 12, "rotation_deg": (0, 0, 20)}, False),
+    ],
+)
+def test_a_hollow_tighter_than_the_probe_is_refused(cylinder, kind, keys, tighter):
+    scene = dataclasses.replace(change(cylinder, task=SMALL), object=ObjectSettings(kind, **keys))
+    if tighter:
+        assert any("tighter than the probe of radius 40 mm" in problem for problem in reasons(scene))
+    else:
+        assert canprobe.plan(scene)
 
 
 def test_start_posture_outside_the_range(cylinder):
@@ -76,11 +82,6 @@ def test_joint_speeds_scale_with_the_contact_speed(cylinder):
     np.testing.assert_allclose(np.array(fast.needed), 3 * np.array(slow.needed), atol=0.01)
 
 
-def test_rolling_share_lowers_joint_speeds(cylinder):
-    pure, half = (canprobe.plan(change(cylinder, task={"rolling_share": v})).joint_speeds for v in (0.0, 0.5))
-    assert max(half.needed) < max(pure.needed)
-
-
 def test_swing_of_a_free_scene():
     scene = load_scene("free")
     speeds = canprobe.plan(scene).joint_speeds
@@ -89,29 +90,7 @@ def test_swing_of_a_free_scene():
     assert any("swing slower" in p for p in reasons(change(scene, task={"swing_period_s": 0.1})))
 
 
-@pytest.mark.parametrize(("rise", "where"), [(10.0, "10.0 mm above"), (-12.0, "12.0 mm below")])
-def test_object_that_the_approach_does_not_find(cylinder, rise, where):
-    (problem,) = reasons(change(cylinder, object={"position_mm": (-120.0, -122.5, 374.0 + rise)}))
-    assert where in problem
-
-
-def test_approach_beside_the_object(cylinder):
-    (problem,) = reasons(change(cylinder, task={"start_mm": (-120.0, -222.5, 374.0)}))
-    assert "does not meet the object" in problem
-
-
-def test_path_that_leaves_the_object(cylinder):
-    (problem,) = reasons(change(cylinder, task={"length_mm": 80.0}))
-    assert "leaves the object" in problem
-
-
-def test_matrix_that_is_no_surface_at_the_origin(cylinder):
-    rows = ((1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, -1.0))
-    (problem,) = reasons(dataclasses.replace(cylinder, object=ObjectSettings("quadric", matrix=rows)))
-    assert problem.startswith("object: matrix must pass through the origin")
-
-
-@pytest.mark.parametrize("name", ["cylinder", "sphere", "saddle", "plane"])
+@pytest.mark.parametrize("name", ["cylinder", "saddle"])
 def test_path_lies_on_the_object_and_spans_the_region(name):
     scene = load_scene(name)
     setup = resolve(scene)

@@ -1,22 +1,18 @@
 """The bus part of a plan against the budget table of the cell, and what does not fit."""
 
 import dataclasses
-import importlib.resources
-import math
 import re
 
 import pytest
 from makes import write_eds
-from scenes import change, reasons, refused, ways_out, with_joints, without_torque
+from scenes import change, reasons, refused, ways_out, with_eds, with_joints, without_torque
 
 import canprobe
-from canprobe.cell.planning.device_capabilities import DeviceCapabilities
 from canprobe.cell.planning.identifiers import identifier_problems
 from canprobe.cell.planning.make import make_plan
 from canprobe.cell.planning.measured import expected_messages
 from canprobe.cell.planning.model import PlannedPdo
 from canprobe.cell.planning.node_configuration import Interpolation
-from canprobe.cell.planning.report import plan_dict
 from canprobe.cell.planning.traffic import controller_starts
 from canprobe.cell.scene.load import dump_scene, load_scene, parse_scene
 from canprobe.cell.scene.resolve import resolve
@@ -64,17 +60,6 @@ def test_budget_table(name, sections, part, bits_per_second, percent):
     assert dict(plan.traffic.parts)["heartbeats"] == pytest.approx(heartbeats)
 
 
-@pytest.mark.parametrize(
-    ("sections", "drives_us", "tactile_us"),
-    [({}, 1565, 4345), ({"arm": {"grouped_rpdo": True}}, 1280, 3775)],
-)
-def test_peak_demand_behind_one_sync(press, sections, drives_us, tactile_us):
-    plan = canprobe.plan(change(press, **sections))
-    one, two = plan.traffic.demands
-    assert (one.cycles, one.used_ns, one.available_ns) == (1, drives_us * 1000, 2_500_000)
-    assert (two.cycles, two.used_ns, two.available_ns) == (2, tactile_us * 1000, 5_000_000)
-
-
 def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(press):
     error = refused(change(press, sensor={"mode": "image"}))
     assert any("worst-case load 152 %" in problem for problem in error.problems)
@@ -89,20 +74,9 @@ def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(press):
     assert str(error).splitlines()[-1] == f"  {error.ways_out[-1]}"
 
 
-OTHER_REFUSALS = pytest.mark.slow(reason="other refusals; tests/cli/test_advice.py types what drawn ones advise")
-
-
-@pytest.mark.parametrize(
-    "sections",
-    [
-        {"sensor": {"mode": "image"}},
-        pytest.param({"bus": {"transmit_queue": "fifo"}}, marks=OTHER_REFUSALS),
-        pytest.param({"cycle": {"rate_hz": 500.0}, "sensor": {"rate_hz": 250.0}}, marks=OTHER_REFUSALS),
-    ],
-)
-def test_ways_out_written_into_the_scene_file_make_it_fit(press, sections):
+def test_ways_out_written_into_the_scene_file_make_it_fit(press):
     """As a user would: what a way out names goes into the file, nothing else."""
-    follow_ways_out(change(press, **sections))
+    follow_ways_out(change(press, sensor={"mode": "image"}))
 
 
 def follow_ways_out(scene):
@@ -165,9 +139,7 @@ def test_six_drives_alone_end_at_500_hz():
     assert any("worst-case load" in problem for problem in reasons(change(free, cycle={"rate_hz": 1000.0})))
 
 
-@pytest.mark.parametrize(
-    ("rate", "period_us", "units"), [(400, 2500, 25), (500, 2000, 20), (200, 5000, 50), (40, 25_000, 250)]
-)
+@pytest.mark.parametrize(("rate", "period_us", "units"), [(400, 2500, 25), (40, 25_000, 250)])
 def test_sync_period(rate, period_us, units):
     plan = canprobe.plan(change(load_scene("free"), cycle={"rate_hz": float(rate)}))
     sync = plan.sync
@@ -175,7 +147,7 @@ def test_sync_period(rate, period_us, units):
     assert {node.interpolation[0] for node in plan.nodes} == {Interpolation(units, -4)}, "as the device has it"
 
 
-@pytest.mark.parametrize("rate", [333.333, 1000 / 3, 333.3333])
+@pytest.mark.parametrize("rate", [333.333, 1000 / 3])
 def test_a_rate_with_six_digits_is_the_rate_of_a_whole_period(rate):
     assert canprobe.plan(change(load_scene("free"), cycle={"rate_hz": rate})).sync.period_ns == 3_000_000
 
@@ -205,7 +177,7 @@ def test_tactile_rate_that_no_trigger_gives(press, rate):
     assert [problem for problem in problems if "sensor.rate_hz" in problem.split("=")[0]]
 
 
-@pytest.mark.parametrize("ratio", [1, 2, 3, 4, 8, 240])
+@pytest.mark.parametrize("ratio", [1, 2, 3, 240])
 def test_tactile_trigger(ratio):
     plan = canprobe.plan(change(load_scene("listen"), sensor={"rate_hz": 400 / ratio}))
     assert {pdo.transmission_type for pdo in plan.pdos} == {ratio}
@@ -245,14 +217,6 @@ def test_grouped_targets_share_an_rpdo_through_dummies():
     assert {(pdo.transmission_type, pdo.event_timer_ms, pdo.rate_hz, pdo.layout.length) for pdo in words} == {
         (255, 250, 10, 2)
     }
-
-
-def test_every_message_meets_its_deadline_and_tactile_waits_for_all_drives(press_plan):
-    assert all(pdo.response_ns <= pdo.deadline_ns for pdo in press_plan.pdos)
-    tactile = [pdo.cob_id for pdo in press_plan.pdos if pdo.node_id == 16]
-    drives = [pdo.cob_id for pdo in press_plan.pdos if pdo.node_id != 16]
-    assert min(tactile) > max(drives)
-    assert max(pdo.response_ns for pdo in press_plan.pdos) == (4345 + 200) * 1000  # from the end of a late SYNC
 
 
 def test_nodes_with_identity_and_what_is_switched_off(press_plan):
@@ -298,126 +262,105 @@ def test_restricted_and_duplicate_identifiers(pdos, count):
     assert len(identifier_problems(pdos)) == count
 
 
-class TestOtherDevices:
-    """The plan works from what an EDS really offers."""
+# --- other devices: the plan works from what an EDS really offers --------------------------------------------------
 
-    @pytest.fixture
-    def edit(self, tmp_path):
-        def edit(*replacements):
-            text = (importlib.resources.files("canprobe.fieldbus.eds") / "puma260_joint.eds").read_text()
-            for pattern, new in replacements:
-                text, count = re.subn(pattern, new, text, flags=re.DOTALL)
-                assert count, pattern
-            path = tmp_path / "other.eds"
-            path.write_text(text)
-            return change(load_scene("free"), arm={"eds": str(path)})
 
-        return edit
+def edited(folder, *edits):
+    return with_eds(load_scene("free"), folder, *edits)
 
-    def test_unknown_eds(self):
-        assert "no such packaged file" in reasons(change(load_scene("free"), arm={"eds": "puma261_joint.eds"}))[0]
 
-    def test_without_dummies_targets_stay_single_and_it_says_so(self, edit):
-        scene = change(edit((r"Dummy0004=1", "Dummy0004=0")), arm={"grouped_rpdo": True})
-        plan = canprobe.plan(scene)
-        assert {pdo.number for pdo in plan.pdos} == {1}
-        ((what, why),) = plan.not_available
-        assert what == "two targets in one RPDO"
-        assert "0004h" in why
+def test_unknown_eds():
+    assert "no such packaged file" in reasons(change(load_scene("free"), arm={"eds": "puma261_joint.eds"}))[0]
 
-    @pytest.mark.parametrize(
-        ("fixed", "why"),
-        [(False, ": 6077h is not mappable to a TPDO"), (True, ": TPDO1 has the fixed mapping 60410010h, 60640020h")],
+
+def test_without_dummies_targets_stay_single_and_it_says_so(tmp_path):
+    scene = change(edited(tmp_path, (r"Dummy0004=1", "Dummy0004=0")), arm={"grouped_rpdo": True})
+    plan = canprobe.plan(scene)
+    assert {pdo.number for pdo in plan.pdos} == {1}
+    ((what, why),) = plan.not_available
+    assert what == "two targets in one RPDO"
+    assert "0004h" in why
+
+
+@pytest.mark.parametrize(
+    ("fixed", "why"),
+    [(False, ": 6077h is not mappable to a TPDO"), (True, ": TPDO1 has the fixed mapping 60410010h, 60640020h")],
+)
+def test_torque_that_cannot_be_mapped_is_left_away_and_it_says_so(tmp_path, fixed, why):
+    plan = canprobe.plan(without_torque(load_scene("free"), tmp_path, fixed=fixed))
+    assert [e.index for e in plan.pdos_of(1, "tpdo")[0].entries] == [0x6041, 0x6064]
+    assert plan.not_available == (("motor torque (torque_permille of log.npz)", f"{plan.nodes[0].eds}{why}"),)
+
+
+def test_each_drive_is_planned_by_its_own_eds(tmp_path):
+    """Makes may be mixed in one arm: a drive without torque, and without dummies, leaves the others as they are."""
+    plain = load_scene("free")
+    scene = edited(tmp_path, (r"(\[6077\][^\[]*PDOMapping=)1", r"\g<1>0"), (r"Dummy0004=1", "Dummy0004=0"))
+    setup = resolve(plain)
+    drives = list(setup.arm.drives)
+    drives[2] = dataclasses.replace(drives[2], eds=scene.arm.eds)
+    plan = make_plan(setup.changed("arm", drives=tuple(drives), grouped=True))
+    assert [node.eds == scene.arm.eds for node in plan.nodes] == [False, False, True, False, False, False]
+    assert [len(plan.pdos_of(n, "tpdo")[0].entries) for n in plan.node_ids] == [3, 3, 2, 3, 3, 3]
+    assert {pdo.number for pdo in plan.pdos} == {1}
+    assert [why.startswith(scene.arm.eds) for _, why in plan.not_available] == [True, True]
+
+
+def test_target_that_cannot_be_mapped_is_refused(tmp_path):
+    problems = reasons(edited(tmp_path, (r"(\[607A\][^\[]*PDOMapping=)1", r"\g<1>0")))
+    assert any("607Ah:00 is not mappable to a RPDO" in problem for problem in problems)
+
+
+def test_missing_objects_are_named(tmp_path):
+    no_60c2 = (r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")
+    problems = reasons(edited(tmp_path, *no_60c2, (r"\[1006\]", "[5FFE]"), (r"=0x1006", "=0x5FFE")))
+    said = "objects 60C2h (interpolation time period) and 1006h (period of SYNC) are missing"
+    assert any(said in problem for problem in problems)
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        (r"AccessType=ro", "(other.eds: 1006h is ro, 0 µs); no period suits all drives"),
+        (r"AccessType=ro\nDefaultValue=2500", None),
+        (r"AccessType=ro\nDefaultValue=4000", "1006h is ro, 4000 µs); take 250 Hz"),
+        (r"LowLimit=4000", "1006h takes 4000 to 4294967295 µs); take 250 Hz"),
+    ],
+)
+def test_a_drive_without_60c2h_takes_the_period_that_1006h_takes(tmp_path, keys, said):
+    """Of two equal keys in a section the first counts."""
+    no_60c2 = (r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")
+    scene = edited(tmp_path, *no_60c2, (r"\[1006\]", rf"[1006]\n{keys}"))
+    if said is None:
+        assert canprobe.plan(scene)
+    else:
+        assert any(said in problem.replace(f"{scene.arm.eds}", "other.eds") for problem in reasons(scene))
+
+
+@pytest.mark.parametrize(
+    ("sub", "keys", "said"),
+    [
+        (
+            1,
+            r"AccessType=ro\nDefaultValue=",
+            "60C2h:01 takes no value by the EDS: no integer, read-only without a default",
+        ),
+        (1, r"DataType=0x9", "60C2h:01 takes no value by the EDS"),
+        (2, r"AccessType=ro\nDefaultValue=3", "60C2h:02 takes no unit of 10^-6 to 10^0 s by the EDS"),
+    ],
+)
+def test_an_interpolation_time_that_nothing_fits_is_said_without_a_hole(tmp_path, sub, keys, said):
+    problems = reasons(edited(tmp_path, (rf"\[60C2sub{sub}\]", rf"[60C2sub{sub}]\n{keys}")))
+    assert any(said in problem for problem in problems)
+
+
+def test_axes_beyond_the_first_are_left_out_and_named(tmp_path):
+    more = "".join(
+        f"[{index:X}]\nParameterName=Controlword\nObjectType=7\nDataType=6\nAccessType=rw\n\n"
+        for index in (0x6840, 0x7040)
     )
-    def test_torque_that_cannot_be_mapped_is_left_away_and_it_says_so(self, tmp_path, fixed, why):
-        plan = canprobe.plan(without_torque(load_scene("free"), tmp_path, fixed=fixed))
-        assert [e.index for e in plan.pdos_of(1, "tpdo")[0].entries] == [0x6041, 0x6064]
-        assert plan.not_available == (("motor torque (torque_permille of log.npz)", f"{plan.nodes[0].eds}{why}"),)
-
-    def test_each_drive_is_planned_by_its_own_eds(self, edit):
-        """Makes may be mixed in one arm: a drive without torque, and without dummies, leaves the others as they are."""
-        plain = load_scene("free")
-        scene = edit((r"(\[6077\][^\[]*PDOMapping=)1", r"\g<1>0"), (r"Dummy0004=1", "Dummy0004=0"))
-        setup = resolve(plain)
-        drives = list(setup.arm.drives)
-        drives[2] = dataclasses.replace(drives[2], eds=scene.arm.eds)
-        plan = make_plan(setup.changed("arm", drives=tuple(drives), grouped=True))
-        assert [node.eds == scene.arm.eds for node in plan.nodes] == [False, False, True, False, False, False]
-        assert [len(plan.pdos_of(n, "tpdo")[0].entries) for n in plan.node_ids] == [3, 3, 2, 3, 3, 3]
-        assert {pdo.number for pdo in plan.pdos} == {1}
-        assert [why.startswith(scene.arm.eds) for _, why in plan.not_available] == [True, True]
-
-    def test_target_that_cannot_be_mapped_is_refused(self, edit):
-        problems = reasons(edit((r"(\[607A\][^\[]*PDOMapping=)1", r"\g<1>0")))
-        assert any("607Ah:00 is not mappable to a RPDO" in problem for problem in problems)
-
-    def test_missing_objects_are_named(self, edit):
-        no_60c2 = (r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")
-        problems = reasons(edit(*no_60c2, (r"\[1006\]", "[5FFE]"), (r"=0x1006", "=0x5FFE")))
-        said = "objects 60C2h (interpolation time period) and 1006h (period of SYNC) are missing"
-        assert any(said in problem for problem in problems)
-
-    @pytest.mark.parametrize(
-        ("keys", "said"),
-        [
-            (r"AccessType=ro", "(other.eds: 1006h is ro, 0 µs); no period suits all drives"),
-            (r"AccessType=ro\nDefaultValue=2500", None),
-            (r"AccessType=ro\nDefaultValue=4000", "1006h is ro, 4000 µs); take 250 Hz"),
-            (r"LowLimit=4000", "1006h takes 4000 to 4294967295 µs); take 250 Hz"),
-        ],
-    )
-    def test_a_drive_without_60c2h_takes_the_period_that_1006h_takes(self, edit, keys, said):
-        """Of two equal keys in a section the first counts."""
-        no_60c2 = (r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")
-        scene = edit(*no_60c2, (r"\[1006\]", rf"[1006]\n{keys}"))
-        if said is None:
-            assert canprobe.plan(scene)
-        else:
-            assert any(said in problem.replace(f"{scene.arm.eds}", "other.eds") for problem in reasons(scene))
-
-    @pytest.mark.parametrize(
-        ("sub", "keys", "said"),
-        [
-            (
-                1,
-                r"AccessType=ro\nDefaultValue=",
-                "60C2h:01 takes no value by the EDS: no integer, read-only without a default",
-            ),
-            (1, r"DataType=0x9", "60C2h:01 takes no value by the EDS"),
-            (2, r"AccessType=ro\nDefaultValue=3", "60C2h:02 takes no unit of 10^-6 to 10^0 s by the EDS"),
-        ],
-    )
-    def test_an_interpolation_time_that_nothing_fits_is_said_without_a_hole(self, edit, sub, keys, said):
-        problems = reasons(edit((rf"\[60C2sub{sub}\]", rf"[60C2sub{sub}]\n{keys}")))
-        assert any(said in problem for problem in problems)
-
-    def test_axes_beyond_the_first_are_left_out_and_named(self, edit):
-        more = "".join(
-            f"[{index:X}]\nParameterName=Controlword\nObjectType=7\nDataType=6\nAccessType=rw\n\n"
-            for index in (0x6840, 0x7040)
-        )
-        left = dict(canprobe.plan(edit((r"\[6041\]", more + "[6041]"))).left_out)
-        assert "has objects of more axes, from 6800h, 7000h" in left["axes 2, 3 of node 4 (joint 4)"]
-
-    def test_abilities_read_from_the_packaged_eds(self):
-        device = DeviceCapabilities.of("puma260_joint.eds", 1)
-        assert device.entry(0x6064, 0, "tpdo").signed
-        assert device.entry(0x6064, 0, "rpdo") is None, "a read-only object cannot be received"
-        assert device.entry(0x607A, 0, "rpdo").bits == 32
-        assert device.dummy(4, 32).is_dummy
-        assert device.dummy(1, 8) is None
-        assert device.pdo_numbers("rpdo") == (1, 2, 3, 4)
-        assert device.fixed_mapping("tpdo", 1)[0] == 0x60410010
-
-
-def test_plan_is_finite_everywhere(press_plan):
-    def check(value):
-        if isinstance(value, float):
-            assert math.isfinite(value)
-        for item in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
-            check(item)
-
-    check(plan_dict(press_plan))
+    left = dict(canprobe.plan(edited(tmp_path, (r"\[6041\]", more + "[6041]"))).left_out)
+    assert "has objects of more axes, from 6800h, 7000h" in left["axes 2, 3 of node 4 (joint 4)"]
 
 
 # --- the budget of one cycle, added up by hand: what each part waits for, in the order of the bus ------------------
@@ -487,8 +430,10 @@ def test_a_sensor_alone_has_a_budget_too():
     assert budget.slack_ns == 2_500_000 - 625_000 - 200_000
 
 
-@pytest.mark.parametrize("mode", ["window", "image"])
-@pytest.mark.parametrize("ids", [(17, 18, 19, 20, 21, 49, 126), (120, 121, 122, 123, 124, 125, 126)])
+@pytest.mark.parametrize(
+    ("mode", "ids"),
+    [("image", (17, 18, 19, 20, 21, 49, 126)), ("window", (120, 121, 122, 123, 124, 125, 126))],
+)
 def test_identifiers_of_the_array_leave_those_of_any_drive_alone(mode, ids, tmp_path):
     """RPDO4 of nodes 17 to 49 are 511h to 531h, where the array's are otherwise; whatever bus they are on."""
     scene = load_scene("cylinder", {"cell": "seven-axis"})

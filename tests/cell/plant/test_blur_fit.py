@@ -18,8 +18,7 @@ def found_blur(image, window=WINDOW):
     return None if found is None else found.blur
 
 
-@pytest.mark.parametrize("blur", [0.45, 0.65, 0.85])
-@pytest.mark.parametrize("kappa", [(0.0, 0.0), (27.8, 0.0), (40.0, 40.0), (20.0, -10.0)])
+@pytest.mark.parametrize(("blur", "kappa"), [(0.45, (0.0, 0.0)), (0.65, (40.0, 40.0)), (0.85, (20.0, -10.0))])
 def test_the_blur_is_found_whatever_is_touched(blur, kappa):
     """A taxel is a pitch wide, which adds 1/12 to the variance; gains of ±5 % cost some percent."""
     config = TaxelConfig(blur_pitch=blur).without("hysteresis", "creep")  # which smear what jumps to and fro

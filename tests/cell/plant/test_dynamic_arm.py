@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from puma_arm import BODIES, ELBOW_FORM, MODELS, UPENN
+from puma_arm import BODIES, ELBOW_FORM, POINT, TOOL, UPENN, pressing
 from scipy.integrate import solve_ivp
 
 from canprobe.cell.plant.config import PlantConfig
@@ -17,31 +17,25 @@ from canprobe.cell.plant.plant import Plant
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import Chain, forward, forward_jacobian
-from canprobe.mechanics.robot.denavit_hartenberg import from_dh, tool_z_offset
+from canprobe.mechanics.robot.denavit_hartenberg import from_dh
 from canprobe.mechanics.robot.model import (
     ArmModel,
     Body,
     Joint,
     joints_per_motor,
-    joints_to_units,
     units_per_motor,
     units_to_joints,
 )
-from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
 
 CYCLE = 2_500_000
-POINT, TOOL = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0)
 POSE = np.eye(4)
 POSE[:3, 3] = POINT
 CYLINDER = make_object("cylinder", T_base_object=POSE, radius=0.036)
-STRETCHED = np.radians((90.0, 10.0, -60.0, 0.0, 60.0, 0.0))
 
 
 def config(depth=0.43e-3, shape=CYLINDER, **dynamics):
-    q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
-    settings = Dynamics(**dynamics)
-    return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, bodies=BODIES["puma260"])
+    return pressing(shape, depth, fidelity="dynamic", dynamics=Dynamics(**dynamics))
 
 
 def without_friction(c):
@@ -89,33 +83,6 @@ def test_asking_changes_nothing():
     assert np.array_equal(ramps(quiet), ramps(curious, extra=ask))
 
 
-@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
-def test_at_rest_the_motors_carry_the_weight_and_nothing_moves(model):
-    arm = DynamicArm(replace(config(shape=None), model=model, q0=STRETCHED, bodies=BODIES[model.name]))
-    start = arm.motors()[0]
-    torques = [arm.torque_permille(i) for i in range(6)]
-    arm.advance(500_000_000)
-    assert arm.motors()[0] == pytest.approx(start, abs=1e-6)
-    body = arm.equations.body
-    share = joints_per_motor(UPENN).T @ body.terms(STRETCHED, 0.0)[1]
-    assert torques == pytest.approx(1e3 * share / np.array((6.4, 6.4, 6.4, 1.4, 0.7, 0.7)), abs=0.51)
-    assert abs(torques[1]) > 100
-
-
-def test_the_push_of_the_object_is_the_force_through_the_jacobian():
-    c = config(friction=0.0)
-    arm, truth = DynamicArm(c), Plant(c).truth()
-    free = DynamicArm(replace(c, object=None))
-    for a in (arm, free):
-        a.equations.hold(state(a))
-    pushed = arm.equations.rate(0.0, state(arm)) - free.equations.rate(0.0, state(free))
-    mass = arm.equations.mass
-    J = forward_jacobian(UPENN.chain, c.q0, TOOL)[1][:3]
-    expected = joints_per_motor(UPENN).T @ J.T @ (truth["force"] * truth["contact_normal"])
-    assert mass @ pushed[6:12] == pytest.approx(expected, rel=1e-9, abs=1e-12)
-    assert truth["force"] > 1.9
-
-
 @pytest.mark.parametrize("rate", [0.3, -0.3, 0.004])
 def test_motors_and_gears_rub_as_published(rate):
     """Viscous and Coulomb friction of each axis, scaled from the PUMA 560's; tanh turns the sign over 0.01 rad/s."""
@@ -128,42 +95,6 @@ def test_motors_and_gears_rub_as_published(rate):
     drag = rough.mass @ (rough.rate(0.0, y) - smooth.rate(0.0, y))[6:12]
     expected = np.array(viscous) * rate + np.array(coulomb) * np.tanh(rate / 0.01)
     assert drag == pytest.approx(-expected, rel=1e-9)
-
-
-def test_friction_drags_against_the_sliding_and_never_feeds_it():
-    c = config()
-    arm, smooth = DynamicArm(c), DynamicArm(replace(c, dynamics=replace(c.dynamics, friction=0.0)))
-    y = state(arm)
-    y[6:9] = 0.02, -0.03, 0.05
-    for a in (arm, smooth):
-        a.equations.hold(y)
-    mass = arm.equations.mass
-    drag = mass @ (arm.equations.rate(0.0, y) - smooth.equations.rate(0.0, y))[6:12]
-    power = float(drag @ y[6:12])
-    sliding = np.linalg.norm(arm.equations.contact.rows[1:, 0] @ y[6:12])
-    normal_force = Plant(c).truth()["force"]
-    assert sliding > 5e-3
-    assert power == pytest.approx(-0.3 * normal_force * sliding, rel=0.05)
-
-
-def test_jacobian_is_the_slope_and_the_shifted_solver_solves():
-    c = config()
-    arm = DynamicArm(c)
-    e, y = arm.equations, state(arm)
-    y[6:12] = 0.004, -0.006, 0.01, 0.02, -0.03, 0.01
-    y[14] += 20.0  # one motor at its torque limit
-    e.hold(y)
-    e.loops.set_reference(0.0, y[:6] + 1e-4, np.full(6, 0.1))
-    slope = np.array([(e.rate(0.0, y + d) - e.rate(0.0, y - d)) / 2e-7 for d in 1e-7 * np.eye(18)]).T
-    J = e.jacobian(0.0, y)
-    left_out = np.zeros((18, 18))
-    assert J[:, 6:] == pytest.approx((slope + left_out)[:, 6:], rel=1e-4, abs=1e-3 * np.abs(J).max() * 1e-3)
-    drift = (e.rate(1e-6, y) - e.rate(-1e-6, y)) / 2e-6
-    assert e.linearised(0.0, y, 7e-4).drift == pytest.approx(drift, rel=1e-5, abs=1e-5)
-    r = np.random.default_rng(0).normal(size=18)
-    assert e.linearised(0.0, y, 7e-4).solve(r) == pytest.approx(
-        np.linalg.solve(np.eye(18) - 7e-4 * J, r), rel=1e-9, abs=1e-12
-    )
 
 
 def test_torque_ends_at_its_limit_and_the_motor_arrives_all_the_same():
@@ -186,14 +117,6 @@ def test_velocity_feed_forward_removes_the_lag(share):
     arm.advance(900_000_000)
     behind = (start + 0.9 * speed - arm.motor_counts(0)) / speed
     assert behind == pytest.approx((1.0 - share) * IdealArm(UPENN, ELBOW_FORM).lag_s, abs=2e-5)
-
-
-def test_the_wrists_coupling_moves_the_motors_of_joints_5_and_6():
-    """Motor coordinates of a turn of joint 4 alone: what the master's decoupling matrix says, in counts."""
-    turn = np.array((0, 0, 0, 0.1, 0, 0))
-    counts = joints_to_units(UPENN, turn)
-    assert np.linalg.inv(joints_per_motor(UPENN)) @ turn * units_per_motor(UPENN) == pytest.approx(counts, abs=1e-9)
-    assert counts[4] == pytest.approx(-9.8462 * 800 * 0.1 / (2 * np.pi))
 
 
 def test_held_dynamics_cost_little_in_a_cycle():
@@ -251,60 +174,52 @@ def gantry():
     return ArmModel(chain, joints, 1e6 * np.eye(3), np.zeros(3)), np.array((0.1, -0.05, 0.2))
 
 
-def on_a_plane(model, q0, depth=2e-4):
-    """The arm with its probe pressed into a plane under it."""
+def puma():
+    """Its wrist is coupled: the motors share the torques of the joints."""
+    return UPENN, ELBOW_FORM
+
+
+def on_a_plane(made, depth=2e-4, friction=1.0):
+    """The arm with its probe pressed into a plane under it; `friction`: share of the joints' Coulomb friction."""
+    model, q0 = made()
+    joints = tuple(replace(joint, coulomb=friction * joint.coulomb) for joint in model.joints)
     centre = (forward(model.chain, q0) @ TOOL)[:3, 3]
     pose = np.eye(4)
     pose[:3, 3] = centre - (0.0, 0.0, 0.04 - depth)
     shape = make_object("plane", T_base_object=pose)
-    return PlantConfig(model, q0, object=shape, fidelity="dynamic", bodies=solids(model.n))
+    bodies = BODIES["puma260"] if made is puma else solids(model.n)
+    return PlantConfig(replace(model, joints=joints), q0, object=shape, fidelity="dynamic", bodies=bodies)
 
 
-OTHERS = pytest.mark.parametrize("made", [seven, gantry])
+EACH = pytest.mark.parametrize("made", [puma, seven, gantry])
 
 
-@OTHERS
-def test_any_arm_carries_its_weight_and_stands_off_the_object(made):
+def rated_torques(model):
+    """(n,) in the drive's own sense."""
+    return np.sign(units_per_motor(model)) * [joint.rated_torque for joint in model.joints]
+
+
+@EACH
+def test_at_rest_the_motors_carry_the_weight_and_nothing_moves(made):
     model, q0 = made()
-    c = on_a_plane(model, q0)
-    free = DynamicArm(replace(c, object=None))
-    rest = free.motors()[0]
-    torques = [free.torque_permille(i) for i in range(model.n)]
-    free.advance(200_000_000)
-    assert free.motors()[0] == pytest.approx(rest, abs=1e-3)
-    assert units_to_joints(model, free.motors()[0]) == pytest.approx(q0, abs=1e-8)
-    weight = joints_per_motor(model).T @ free.equations.body.terms(q0, 0.0)[1]
-    rated = np.sign(units_per_motor(model)) * [joint.rated_torque for joint in model.joints]  # in the drive's own sense
-    assert torques == pytest.approx(1e3 * weight / rated, abs=0.51)
+    arm = DynamicArm(replace(on_a_plane(made), object=None))
+    rest = arm.motors()[0]
+    torques = [arm.torque_permille(i) for i in range(model.n)]
+    arm.advance(200_000_000)
+    assert arm.motors()[0] == pytest.approx(rest, abs=1e-3)
+    assert units_to_joints(model, arm.motors()[0]) == pytest.approx(q0, abs=1e-8)
+    weight = joints_per_motor(model).T @ arm.equations.body.terms(q0, 0.0)[1]
+    assert torques == pytest.approx(1e3 * weight / rated_torques(model), abs=0.51)
     if made is gantry:  # masses of z and the probe
         assert weight == pytest.approx((0.0, 0.0, 9.81 * (1.6 + 0.3)), abs=1e-9)
-        assert np.diag(free.equations.mass) == pytest.approx(5.0 + np.array((5.7, 3.7, 1.9)))  # with rotors
-    pressed = Plant(c)
-    before = pressed.truth()["force"]
-    pressed.advance(500_000_000)
-    after = pressed.truth()["force"]
-    assert before > 0.4
-    assert after == pytest.approx(before, rel=0.02)  # friction holds the rest
+        assert np.diag(arm.equations.mass) == pytest.approx(5.0 + np.array((5.7, 3.7, 1.9)))  # with rotors
 
 
-@OTHERS
-def test_the_push_on_any_arm_is_the_force_through_its_jacobian(made):
-    model, q0 = made()
-    c = replace(on_a_plane(model, q0), dynamics=Dynamics(friction=0.0))
-    truth = Plant(c).truth()
-    equations = ArmEquations(c)
-    theta = np.linalg.solve(joints_per_motor(model), q0)
-    equations.hold(equations.resting(theta))
-    J = forward_jacobian(model.chain, q0, TOOL)[1][:3] @ joints_per_motor(model)
-    push = equations.contact.push(theta, np.zeros(model.n))
-    assert push == pytest.approx(J.T @ (truth["force"] * truth["contact_normal"]), rel=1e-9, abs=1e-12)
-
-
-@OTHERS
-def test_any_arm_follows_its_drives_as_scipys_radau_integrates_it(made):
+@pytest.mark.parametrize("made", [seven, gantry])
+def test_an_arm_follows_its_drives_as_scipys_radau_integrates_it(made):
     """Every motor on a ramp of its own, sliding over the plane, nothing held in the reference."""
-    model, q0 = made()
-    c = on_a_plane(model, q0)
+    model, _ = made()
+    c = on_a_plane(made)
     arm, exact, cycles = DynamicArm(c), ArmEquations(c, held=False), 8
     scale = units_per_motor(model)
     start, step = np.array(arm.motors()[0]), 4e-5 * scale * (1.0 + np.arange(model.n)) / model.n
@@ -325,36 +240,23 @@ def test_any_arm_follows_its_drives_as_scipys_radau_integrates_it(made):
     assert np.abs(moved).max() > 3.0
 
 
-@OTHERS
-def test_slopes_of_any_arm_are_those_of_its_equations(made):
+@EACH
+def test_slopes_are_those_of_the_equations_and_the_shifted_solver_solves(made):
     model, q0 = made()
-    n, e = model.n, ArmEquations(on_a_plane(model, q0))
+    n, e = model.n, ArmEquations(on_a_plane(made))
     y = e.resting(np.linalg.solve(joints_per_motor(model), q0))
     y[n : 2 * n] = 1e-3 * (1.0 + np.arange(n))
-    y[2 * n] += 1e4  # one motor at its limit
+    y[2 * n] += 3.0 * e.loops.limit[0]  # one motor at its limit
     e.hold(y)
     e.loops.set_reference(0.0, y[:n] + 1e-4, np.full(n, 0.1))
     J = e.jacobian(0.0, y)
     slope = np.array([(e.rate(0.0, y + d) - e.rate(0.0, y - d)) / 2e-7 for d in 1e-7 * np.eye(3 * n)]).T
     assert J[:, n:] == pytest.approx(slope[:, n:], rel=1e-4, abs=1e-5 * np.abs(J).max())
+    drift = (e.rate(1e-6, y) - e.rate(-1e-6, y)) / 2e-6
+    assert e.linearised(0.0, y, 7e-4).drift == pytest.approx(drift, rel=1e-5, abs=1e-5)
     r = np.random.default_rng(0).normal(size=3 * n)
     solved = e.linearised(0.0, y, 7e-4).solve(r)
     assert solved == pytest.approx(np.linalg.solve(np.eye(3 * n) - 7e-4 * J, r), rel=1e-8, abs=1e-9)
-
-
-@OTHERS
-def test_an_ideal_arm_of_any_kind_follows_too(made):
-    model, q0 = made()
-    plant = Plant(replace(on_a_plane(model, q0), fidelity="ideal", bodies=None))
-    goal = joints_to_units(model, q0 + 0.01)
-    for i in range(model.n):
-        plant.set_ramp(i, plant.motor_counts(i), float(goal[i]), 0, 50_000_000)
-    plant.advance(10_000_000)
-    senses = np.sign(goal - joints_to_units(model, q0))
-    assert [np.sign(plant.torque_permille(i)) for i in range(model.n)] == senses.tolist()
-    plant.advance(500_000_000)
-    assert plant.truth()["q"] == pytest.approx(q0 + 0.01, abs=1e-9)
-    assert plant.truth()["probe_centre"] == pytest.approx((forward(model.chain, q0 + 0.01) @ TOOL)[:3, 3], abs=1e-9)
 
 
 def test_an_arm_without_bodies_has_no_dynamics():
@@ -362,18 +264,9 @@ def test_an_arm_without_bodies_has_no_dynamics():
         DynamicArm(replace(config(), bodies=None))
 
 
-def puma():
-    return UPENN, ELBOW_FORM
-
-
 def pressed(made, force_n, fidelity, friction):
     """A plant at rest with its probe on a plane; `friction`: share of the joints' and the contact's friction."""
-    model, q0 = made()
-    joints = tuple(replace(joint, coulomb=friction * joint.coulomb) for joint in model.joints)
-    depth = depth_for_force(force_n, (0.0, 0.0), 0.04, 1.27e8)
-    c = on_a_plane(replace(model, joints=joints), q0, depth)
-    if made is puma:
-        c = replace(c, bodies=BODIES["puma260"])
+    c = on_a_plane(made, depth_for_force(force_n, (0.0, 0.0), 0.04, 1.27e8), friction)
     plant = Plant(replace(c, fidelity=fidelity, dynamics=Dynamics(friction=0.3 * friction)))
     plant.advance(800_000_000)
     return plant
@@ -381,17 +274,14 @@ def pressed(made, force_n, fidelity, friction):
 
 @pytest.mark.parametrize(("made", "force_n"), [(puma, 3.0), (seven, 30.0), (gantry, 30.0)])
 def test_both_arms_report_the_torque_against_a_push(made, force_n):
-    """At rest the dynamic arm's torque is weight less push, but for what friction carries; the ideal one has no weight.
-
-    The wrist of the PUMA is coupled: its motors share the torques of its joints.
-    """
+    """At rest the dynamic arm's is weight less push, but for what friction carries; the ideal arm has no weight."""
     for friction in (1.0, 0.0):
         ideal, dynamic = (pressed(made, force_n, fidelity, friction) for fidelity in ("ideal", "dynamic"))
         model = dynamic.arm.model
         ratio = dynamic.truth()["force"] / ideal.truth()["force"]
         assert ratio == pytest.approx(1.0, abs=0.02)
         weight = joints_per_motor(model).T @ dynamic.arm.equations.body.terms(dynamic.truth()["q"], 0.0)[1]
-        rated = np.sign(units_per_motor(model)) * [joint.rated_torque for joint in model.joints]
+        rated = rated_torques(model)
         found = [dynamic.torque_permille(i) for i in range(model.n)] - 1e3 * weight / rated
         push = np.array([ideal.torque_permille(i) for i in range(model.n)])
         J = forward_jacobian(model.chain, ideal.truth()["q"], TOOL)[1][:3] @ joints_per_motor(model)

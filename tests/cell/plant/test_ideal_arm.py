@@ -29,10 +29,6 @@ def rates(a):
     return np.array(a.motors()[1])
 
 
-def joints(a):
-    return units_to_joints(UPENN, counts(a))
-
-
 def reference_run(a, start, ramps, t_ns):
     """Position and rate of one motor by the matrix exponential of (q, v, r, slope)."""
     A = np.zeros((4, 4))
@@ -77,20 +73,6 @@ def test_ramps_and_holds_are_solved_exactly():
         assert (counts(a)[2], rates(a)[2]) == pytest.approx((q, v), abs=1e-6)
 
 
-def test_a_ramp_in_progress_is_solved_exactly():
-    a = arm()
-    start = float(counts(a)[0])
-    a.set_ramp(0, start, start + 100.0, 2 * MS, 12 * MS)
-    for t in (1 * MS, 2 * MS, 7 * MS, 12 * MS, 30 * MS):
-        a.advance(t)
-        w, lag = a.w, a.lag_s
-        tau = 1e-9 * max(0, min(t, 12 * MS) - 2 * MS)
-        rising = 1e4 * (tau - lag + (lag + tau) * math.exp(-w * tau))  # critically damped ramp response
-        if t <= 12 * MS:
-            assert counts(a)[0] - start == pytest.approx(rising, abs=1e-8)
-    assert counts(a)[0] - start == pytest.approx(100.0, abs=25.0)
-
-
 @settings(max_examples=25)
 @given(
     cuts=st.lists(st.integers(1, 60 * MS), max_size=12),
@@ -128,34 +110,15 @@ def test_steady_ramp_lags_by_two_over_the_frequency():
     assert a.lag_s == pytest.approx(2.0 / a.w)
 
 
-def test_axes_are_independent_and_hold_without_a_ramp():
-    a = arm()
-    before = counts(a)
-    a.set_ramp(3, before[3], before[3] + 50.0, 0, 2 * MS)
-    a.advance(1000 * MS)
-    assert counts(a) - before == pytest.approx((0, 0, 0, 50.0, 0, 0), abs=1e-9)
-    assert joints(a) == pytest.approx(UPENN.q_per_unit @ counts(a))
-
-
 def test_motors_not_joints_hold_the_wrist():
     """Joint 4 turned alone by its motor drags joints 5 and 6: the master has to decouple."""
     a = arm()
     goal = joints_to_units(UPENN, ELBOW_FORM + np.array((0, 0, 0, 0.1, 0, 0)))
     a.set_ramp(3, counts(a)[3], goal[3], 0, MS)
     a.advance(2000 * MS)
-    moved = joints(a) - ELBOW_FORM
+    moved = units_to_joints(UPENN, counts(a)) - ELBOW_FORM
     assert moved[3] == pytest.approx(0.1)
     assert moved[4] == pytest.approx(0.1 * 9.8462 / 39.3846, rel=1e-4)
-
-
-def test_time_never_runs_backwards():
-    a = arm()
-    a.set_ramp(0, counts(a)[0], counts(a)[0] + 10.0, 0, 5 * MS)
-    a.advance(4 * MS)
-    here = counts(a)
-    a.advance(MS)
-    assert a.t_ns == 4 * MS
-    assert np.array_equal(counts(a), here)
 
 
 def test_a_new_ramp_replaces_the_old_one_and_what_was_to_come():
@@ -197,10 +160,6 @@ def test_torque_is_zero_at_rest_and_follows_motion():
     a.set_ramp(0, start, start + 46.72e3 / (2 * math.pi), 0, 1000 * MS)  # joint 1 at 1 rad/s
     a.advance(700 * MS)
     assert a.torque_permille(0) == pytest.approx(1000 * (2.2 + 0.32) / 6.4, abs=1)
-    back = arm()
-    back.set_ramp(0, start, start - 46.72e3 / (2 * math.pi), 0, 1000 * MS)
-    back.advance(700 * MS)
-    assert back.torque_permille(0) == -a.torque_permille(0)
 
 
 def test_torque_is_kept_within_the_peak():
@@ -208,17 +167,6 @@ def test_torque_is_kept_within_the_peak():
     a.set_ramp(0, counts(a)[0] + 1e6, counts(a)[0] + 1e6, 0, 0)
     a.advance(MS)
     assert a.torque_permille(0) == 2000
-
-
-@pytest.mark.parametrize("axis", range(6))
-def test_motor_dynamics_agree_with_the_torque_of_a_steady_motion(axis):
-    a = arm()
-    gain, coulomb, damping = Plant(PlantConfig(UPENN, ELBOW_FORM)).motor_dynamics(axis)
-    start, rate = counts(a)[axis], 20_000.0
-    a.set_ramp(axis, start, start + rate, 0, 1000 * MS)
-    a.advance(900 * MS)
-    needed = coulomb + rate * damping / gain  # where gain (torque - coulomb) = damping v
-    assert a.torque_permille(axis) == pytest.approx(needed, abs=0.6)
 
 
 def test_motor_dynamics_of_joint_1():

@@ -59,7 +59,7 @@ def test_no_step_makes_the_stiffest_command_diverge_or_swing(name, h):
     assert seen[-1] <= made.coulomb / KP_MAX + 1e-6, "friction alone holds it off the target"
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(6))
 def test_any_commands_in_steps_of_any_length_stay_within_what_the_torque_can_do(seed):
     rng = random.Random(seed)
     ranges = TYPES[rng.choice(list(TYPES))]

@@ -17,7 +17,7 @@ EXACT = PatchCalibration()
 PITCH = EXACT.pad.pitch_m
 FULL_PA = 100e3
 SOFT = 2.3e7  # N/m³: 4 kN/m at 2 N on the cylinder
-SHAPES = {"plane": (0.0, 0.0), "cylinder": (1 / 0.036, 0.0), "sphere": (20.0, 20.0)}
+CYLINDER = (1 / 0.036, 0.0)
 
 
 def paraboloid(u=0.4, v=-0.3, half=(4.5, 7.0), turn=0.5, peak=60e3):
@@ -41,7 +41,7 @@ def completed(pressure, window):
     return Continuation(EXACT.weights, FULL_PA).completed(pressure, window, float(pressure.max()))
 
 
-@pytest.mark.parametrize("window", [(4, 4, 8, 8), (5, 3, 8, 8), (6, 5, 6, 6), (3, 3, 10, 10)])
+@pytest.mark.parametrize("window", [(5, 3, 8, 8), (6, 5, 6, 6)])
 def test_a_quadratic_is_carried_on_exactly(window):
     whole = paraboloid()
     assert seen(whole, window).sum() < 0.99 * whole.sum()
@@ -75,11 +75,9 @@ def test_a_patch_that_the_window_holds_is_the_same_with_and_without_it():
     assert compute_patch(counts, EXACT, (4, 4, 8, 8)) == compute_patch(counts, EXACT)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_force_and_centroid_of_a_soft_contact(shape):
+def test_force_and_centroid_of_a_soft_contact():
     """The emulated array, 2 N at 4 kN/m, its window as it follows the contact; the truth is the whole image's."""
-    kappa = SHAPES[shape]
-    depth = depth_for_force(2.0, kappa, EXACT.pad.radius_m, SOFT)
+    depth = depth_for_force(2.0, CYLINDER, EXACT.pad.radius_m, SOFT)
     force, cut, off, cut_off = [], [], [], []
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -89,7 +87,7 @@ def test_force_and_centroid_of_a_soft_contact(shape):
         origin = middle()
         for t in np.arange(0.0, 1.0, 0.1):
             way = 1e-3 * np.sin(3.0 * t)
-            image = array.image((u + way, v - way), depth * min(1.0, 2.0 * t), kappa, axes, float(t))
+            image = array.image((u + way, v - way), depth * min(1.0, 2.0 * t), CYLINDER, axes, float(t))
             origin = follow(image.astype(float), origin)
         window = (*origin, 8, 8)
         whole, patch = compute_patch(image, EXACT), compute_patch(seen(image, window), EXACT, window)
@@ -106,9 +104,7 @@ def test_force_and_centroid_of_a_soft_contact(shape):
     assert np.mean(off) < 0.5 * np.mean(cut_off)
 
 
-@pytest.mark.parametrize(
-    ("side", "stiffness"), [(6, 1.27e7), (6, 2.3e7), (6, 6e7), (6, 1.27e8), (8, 1.27e7), (8, 6e7), (10, 1.27e7)]
-)
+@pytest.mark.parametrize(("side", "stiffness"), [(6, 2.3e7), (6, 1.27e8), (8, 1.27e7), (10, 1.27e7)])
 def test_what_the_plan_says_of_a_window_that_cuts(side, stiffness):
     """2 N on a plane, against the whole image: within the share that `cut_patch` tells."""
     probe = Probe(np.eye(4), EXACT.pad.radius_m, stiffness, 0.3)
@@ -129,15 +125,13 @@ def around(image, side):
     return [int(np.clip(round(place - (side - 1) / 2), 0, MAX_SIDE - side)) for place in places]
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_what_an_array_remembers_is_not_made_larger(seed):
+def test_what_an_array_remembers_is_not_made_larger():
     """After a long press few taxels are above the threshold, in whole counts and noise: no summit that can be seen."""
-    array = TaxelArray(TaxelConfig(), np.random.default_rng(seed))
-    kappa, axes, origin = SHAPES["cylinder"], np.eye(2), middle()
+    array, origin = TaxelArray(TaxelConfig(), np.random.default_rng(0)), middle()
     for t_s in np.arange(0.0, 3.0, 0.05):
-        array.image((0.0, 0.0), depth_for_force(4.5, kappa, 0.04, 1.27e8), kappa, axes, t_s)
+        array.image((0.0, 0.0), depth_for_force(4.5, CYLINDER, 0.04, 1.27e8), CYLINDER, np.eye(2), t_s)
     for t_s in np.arange(3.2, 5.0, 0.005):
-        image = array.image((0.0, 0.0), -1.0, kappa, axes, t_s)
+        image = array.image((0.0, 0.0), -1.0, CYLINDER, np.eye(2), t_s)
         origin = follow(image, origin)
         window = (*origin, 8, 8)
         assert compute_patch(seen(image, window), EXACT, window).force <= 1.2 * compute_patch(image, EXACT).force

@@ -47,11 +47,9 @@ def test_moments_of_an_elliptic_patch(u0, v0, angle):
 
 def test_nothing_there():
     patch = compute_patch(np.full((16, 16), 4, np.uint8), PatchCalibration())
-    assert patch.force == 0.0
+    assert (patch.force, patch.n_active) == (0.0, 0)
     assert math.isnan(patch.u)
-    assert patch.n_active == 0
-    assert patch.too_few
-    assert not patch.good
+    assert patch.too_few and not patch.good
 
 
 def test_flags():
@@ -91,12 +89,11 @@ def features_of(image):
 EDGE = 8 * PITCH
 
 
-@pytest.mark.parametrize("radius", [3e-3, 5e-3, 7e-3])
-@pytest.mark.parametrize("towards", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+@pytest.mark.parametrize(("radius", "towards"), [(3e-3, (1, 0)), (7e-3, (-1, 0)), (5e-3, (0, 1)), (5e-3, (0, -1))])
 def test_a_contact_that_runs_off_the_pad_is_told(radius, towards):
     """Not while all of it is on the pad, nor where a hundredth is lost; always from a third on."""
     whole = math.pi * radius**2 * 80e3 / 2
-    for place in np.linspace(0.0, EDGE + 0.8 * radius, 40):
+    for place in np.linspace(0.0, EDGE + 0.8 * radius, 20):
         image = press(towards[0] * place, towards[1] * place, radius, radius)
         seen, told = compute_patch(image, EXACT), patch_from_features(features_of(image), EXACT)
         lost = 1.0 - told.force / whole
@@ -148,7 +145,7 @@ def pressed(u, v, dead=(), kappa=(27.8, 0.0), seed=0):
 
 
 def test_a_whole_patch_is_left_alone():
-    for seed in range(40):
+    for seed in range(10):
         u, v = np.random.default_rng(seed).uniform(-3.0, 3.0, 2)
         image = pressed(u, v, seed=seed)
         whole, dead = mended(image)
@@ -157,7 +154,7 @@ def test_a_whole_patch_is_left_alone():
         assert compute_patch(image, PatchCalibration()).doubts == ()
 
 
-@pytest.mark.parametrize("place", [(7, 7), (8, 7), (9, 7), (6, 8)])
+@pytest.mark.parametrize("place", [(7, 7), (6, 8)])
 def test_a_dead_taxel_is_bridged_and_told(place):
     """Centroid within 0.03 of a pitch, force within 2 %; further from the truth where it is left alone."""
     bridged, alone = [], []
@@ -172,14 +169,9 @@ def test_a_dead_taxel_is_bridged_and_told(place):
         assert patch.doubts == (Doubt.DEAD,)
         bridged.append(np.hypot(patch.u - whole.u, patch.v - whole.v) / TAXEL_PITCH)
         assert patch.force == pytest.approx(whole.force, rel=0.02)
-        axis = np.arange(MAX_SIDE) - 7.5
-        counts = image / image.sum()
-        alone.append(
-            np.hypot(
-                counts.sum(axis=0) @ axis - whole.u / TAXEL_PITCH, counts.sum(axis=1) @ axis - whole.v / TAXEL_PITCH
-            )
-        )
-        assert image.sum() < 0.98 * pressed(u, v, seed=seed).sum()
+        axis, counts = np.arange(MAX_SIDE) - 7.5, image / image.sum()
+        centroid = TAXEL_PITCH * np.array((counts.sum(axis=0) @ axis, counts.sum(axis=1) @ axis))
+        alone.append(np.hypot(centroid[0] - whole.u, centroid[1] - whole.v) / TAXEL_PITCH)
     assert max(bridged) < 0.03
     assert np.mean(bridged) < 0.5 * np.mean(alone)
 
@@ -193,6 +185,4 @@ def test_the_mean_of_its_neighbours_is_put_in():
     assert dead == 1
     assert whole[6, 6] == 75
     assert image[6, 6] == 0
-    assert np.array_equal(
-        np.delete(whole.reshape(-1), 6 * MAX_SIDE + 6), np.delete(image.reshape(-1), 6 * MAX_SIDE + 6)
-    )
+    assert np.count_nonzero(whole != image) == 1

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from puma_arm import BODIES, ELBOW_FORM, UPENN
+from puma_arm import BODIES, ELBOW_FORM, POINT, TOOL, UPENN, pressing
 from scipy.spatial.transform import Rotation
 
 from canprobe.cell.plant.config import PlantConfig, PressMotion
@@ -14,29 +14,20 @@ from canprobe.cell.plant.pressure import pad_direction
 from canprobe.cell.plant.taxels import IDEAL_TAXELS
 from canprobe.errors import PlanError
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
-from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.inverse import inverse_near
 from canprobe.mechanics.robot.model import joints_per_motor, joints_to_units, units_per_motor, units_to_joints
-from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.touch.shapes import LIP_M
 
 PITCH_M = 1.5875e-3
 MS = 1_000_000
 CYCLE = 2_500_000
-POINT = np.array((-0.120, -0.1225, 0.374))
-TOOL = tool_z_offset(80.0)
 SHAPES = {
     "plane": {},
-    "sphere": {"radius": 0.05},
     "cylinder": {"radius": 0.036},
     "saddle": {"radius_x": 0.06, "radius_y": -0.08},
 }
-EACH = pytest.mark.parametrize("kind", SHAPES)
-KEYS = {
-    "q": (6,), "probe_centre": (3,), "pole": (3,), "force": (), "depth": (), "depth_rate": (), "contact_point": (3,),
-    "contact_normal": (3,), "kappa": (2,), "direction1": (3,), "direction2": (3,), "pad_uv": (2,), "in_contact": (),
-}  # fmt: skip
+BENT = pytest.mark.parametrize("kind", ["cylinder", "saddle"])
 
 
 def placed(kind, yaw_deg=-48.81, tilt_deg=0.0):
@@ -48,8 +39,7 @@ def placed(kind, yaw_deg=-48.81, tilt_deg=0.0):
 
 def plant(kind="cylinder", *, depth=0.4e-3, tilt_deg=0.0, **settings):
     shape = placed(kind, tilt_deg=tilt_deg)
-    q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
-    return Plant(PlantConfig(UPENN, q0, object=shape, **settings))
+    return Plant(pressing(shape, depth, **settings))
 
 
 def posture_of(T_base_probe):
@@ -63,15 +53,7 @@ def push(p, q_to, t0, t1):
         p.set_ramp(axis, p.motor_counts(axis), float(goal[axis]), t0, t1)
 
 
-@EACH
-def test_truth_has_its_keys_and_shapes(kind):
-    truth = plant(kind).truth()
-    assert {k: np.shape(v) for k, v in truth.items()} == KEYS
-    assert truth["in_contact"] is True
-    assert all(np.all(np.isfinite(v)) for v in truth.values())
-
-
-@EACH
+@pytest.mark.parametrize("kind", SHAPES)
 def test_start_depth_and_force_are_as_asked(kind):
     kappa = placed(kind).closest(POINT).kappa
     depth = depth_for_force(2.0, tuple(kappa), 0.04, 1.27e8)
@@ -84,7 +66,7 @@ def test_start_depth_and_force_are_as_asked(kind):
     assert truth["pad_uv"] == pytest.approx((0, 0), abs=1e-12)
 
 
-@EACH
+@BENT
 def test_contact_geometry_closes_while_the_arm_moves(kind):
     p = plant(kind)
     push(p, p.truth()["q"] + np.array((0.02, 0.004, -0.006, 0.03, -0.05, 0.1)), 0, 40 * MS)
@@ -101,7 +83,7 @@ def test_contact_geometry_closes_while_the_arm_moves(kind):
     assert np.linalg.norm(t["pad_uv"]) > 1e-4
 
 
-@EACH
+@BENT
 def test_depth_rate_is_the_derivative_of_depth(kind):
     p = plant(kind)
     push(p, p.truth()["q"] + np.array((0.02, 0.004, -0.006, 0.03, -0.05, 0.1)), 0, 30 * MS)
@@ -148,9 +130,8 @@ def test_repeated_calls_at_one_instant_change_nothing():
     assert all(np.array_equal(a, b) for a, b in zip(p.truth().values(), twin.truth().values(), strict=True))
 
 
-@EACH
-def test_truth_of_a_state_taken_earlier_is_the_truth_of_then(kind):
-    p = plant(kind)
+def test_truth_of_a_state_taken_earlier_is_the_truth_of_then():
+    p = plant()
     push(p, p.truth()["q"] + np.array((0.02, 0.004, -0.006, 0.03, -0.05, 0.1)), 0, 40 * MS)
     p.advance(20 * MS)
     state, then = p.state(), p.truth()
@@ -159,19 +140,13 @@ def test_truth_of_a_state_taken_earlier_is_the_truth_of_then(kind):
     assert all(np.array_equal(a, b) for a, b in zip(p.truth(state).values(), then.values(), strict=True))
 
 
-def test_same_seed_same_images_other_seed_other_images():
-    one, same, other = (plant(seed=s) for s in (3, 3, 4))
-    assert np.array_equal(one.sample_image(MS), same.sample_image(MS))
-    assert not np.array_equal(one.sample_image(2 * MS), other.sample_image(2 * MS))
-
-
 def test_the_caller_may_keep_and_change_an_image():
     p = plant()
     p.sample_image(MS)[:] = 7
     assert not np.all(p.sample_image(MS) == 7)
 
 
-@EACH
+@BENT
 def test_image_is_the_overlap_of_probe_and_object_in_base(kind):
     """Every taxel against the signed distance of its own point: no shared formula, any flipped axis shows."""
     shape = placed(kind, tilt_deg=3.0)
@@ -198,21 +173,6 @@ def test_image_is_the_overlap_of_probe_and_object_in_base(kind):
     assert np.linalg.norm(p.truth()["pad_uv"]) > 1e-3
 
 
-def test_a_turned_tool_turns_the_pad():
-    shape = placed("sphere")
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    q = start_posture(
-        UPENN, POINT + np.array((0.002, 0.001, 0.0)), (0, 0, 1), ELBOW_FORM, radius_m=0.0395, T_flange_probe=TOOL
-    )
-    straight, turned = (Plant(PlantConfig(UPENN, q, T, object=shape, taxels=IDEAL_TAXELS)) for T in (TOOL, TOOL @ turn))
-    (u, v), (u90, v90) = straight.truth()["pad_uv"], turned.truth()["pad_uv"]
-    assert (u90, v90) == pytest.approx((v, -u), abs=1e-12)
-    assert straight.truth()["force"] == turned.truth()["force"]
-    # u' = v and v' = -u: row i' of the turned image is column 15 - i' of the straight one.
-    assert np.array_equal(turned.sample_image(0), straight.sample_image(0).T[::-1])
-
-
 def test_in_the_air_the_closest_point_is_still_reported():
     truth = plant(depth=-5e-3).truth()
     assert (truth["force"], truth["in_contact"]) == (0.0, False)
@@ -224,7 +184,6 @@ def test_in_the_air_the_closest_point_is_still_reported():
 def test_arm_without_an_object():
     p = Plant(PlantConfig(UPENN, ELBOW_FORM))
     truth = p.truth()
-    assert {k: np.shape(v) for k, v in truth.items()} == KEYS
     assert truth["in_contact"] is False
     assert all(np.all(np.isfinite(v)) for v in truth.values())
     assert truth["probe_centre"] == pytest.approx((forward(UPENN.chain, ELBOW_FORM) @ TOOL)[:3, 3])
@@ -235,10 +194,9 @@ def test_arm_without_an_array_gives_dark_images():
     assert not plant(taxels=None).sample_image(0).any()
 
 
-@EACH
-def test_sensor_alone_is_pressed_slowly_around_the_force(kind):
-    p = Plant(PlantConfig(None, object=placed(kind, tilt_deg=20.0)))
-    mean = depth_for_force(2.0, tuple(placed(kind).closest(POINT).kappa), 0.04, 1.27e8)
+def test_sensor_alone_is_pressed_slowly_around_the_force():
+    p = Plant(PlantConfig(None, object=placed("cylinder", tilt_deg=20.0)))
+    mean = depth_for_force(2.0, (1 / 0.036, 0.0), 0.04, 1.27e8)
     depths = []
     for k in range(401):
         p.advance(k * 5 * MS)
@@ -292,21 +250,6 @@ def test_a_hollow_as_tight_as_the_probe_is_refused():
     Plant(PlantConfig(None, object=make_object("bowl", T_base_object=np.eye(4), radius=0.06)))
 
 
-def test_real_centroid_follows_the_true_contact_point():
-    p = plant("cylinder", depth=0.43e-3)
-    push(p, p.truth()["q"] + np.array((0.0, 0.0, 0.0, 0.0, 0.04, 0.0)), 0, 200 * MS)
-    errors = []
-    axis = (np.arange(16) - 7.5) * PITCH_M
-    for k in range(1, 30):
-        image = p.sample_image(k * 5 * MS).astype(float)
-        if image.sum() == 0:
-            continue
-        centroid = np.array((image.sum(0) @ axis, image.sum(1) @ axis)) / image.sum()
-        errors.append(np.linalg.norm(centroid - p.truth()["pad_uv"]))
-    assert len(errors) > 10
-    assert np.median(errors) < 0.2e-3
-
-
 @pytest.mark.parametrize("fidelity", ["ideal", "dynamic"])
 def test_limit_switches_stand_just_outside_of_the_joints_range_where_the_other_motors_are(fidelity):
     p = Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None, fidelity=fidelity, bodies=BODIES["puma260"]))
@@ -346,7 +289,7 @@ def test_a_compliant_joint_gives_way_by_torque_over_stiffness_and_the_encoders_d
 
 @pytest.mark.parametrize("fidelity", ["ideal", "dynamic"])
 def test_a_plant_that_waits_does_to_the_last_bit_the_same_whenever_its_time_begins(fidelity):
-    config = PlantConfig(UPENN, ELBOW_FORM, object=placed("sphere"), fidelity=fidelity, bodies=BODIES["puma260"])
+    config = PlantConfig(UPENN, ELBOW_FORM, object=placed("cylinder"), fidelity=fidelity, bodies=BODIES["puma260"])
 
     def course(begin_ns):
         p = Plant(config, waits=True)

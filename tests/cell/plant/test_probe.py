@@ -1,4 +1,4 @@
-"""Elastic contact: published values, the integral of the pressure, damping that never pulls."""
+"""Elastic contact: the integral of the pressure, its inverse, damping that never pulls."""
 
 import math
 
@@ -17,27 +17,6 @@ SURFACES = pytest.mark.parametrize("kappa", [PLANE, CYLINDER, SADDLE], ids=["pla
 def half_axes(depth, kappa):
     """Of the patch, along the directions of both curvatures."""
     return [math.sqrt(depth / half) for half in relative_curvatures(kappa, R)]
-
-
-def stiffness(depth, kappa, h=1e-8):
-    """Slope of the force."""
-    return (elastic_contact(depth + h, kappa, R, K).force - elastic_contact(depth - h, kappa, R, K).force) / (2 * h)
-
-
-def test_published_values_on_a_plane():
-    depth = depth_for_force(1.0, PLANE, R, K)
-    assert depth == pytest.approx(0.25e-3, rel=0.01)
-    assert elastic_contact(depth, PLANE, R, K).force == pytest.approx(1.0, rel=2e-3)
-    assert half_axes(depth, PLANE) == pytest.approx([4.47e-3, 4.47e-3], rel=2e-3)
-    assert stiffness(depth, PLANE) == pytest.approx(8e3, rel=0.01)
-
-
-def test_published_values_on_the_cylinder():
-    depth = depth_for_force(2.0, CYLINDER, R, K)
-    assert depth == pytest.approx(0.426e-3, rel=2e-3)
-    assert half_axes(depth, CYLINDER) == pytest.approx([4.02e-3, 5.84e-3], rel=2e-3)
-    assert stiffness(depth, CYLINDER) == pytest.approx(9.4e3, rel=5e-3)
-    assert 45e3 < K * depth < 64e3
 
 
 @SURFACES
@@ -69,15 +48,6 @@ def test_damping_adds_while_loading_and_never_pulls():
     assert leaving.force == pytest.approx(still.force * (1 - 1.5 * 0.3 * 0.01))
     assert loading.force / still.force == pytest.approx(loading.damping_factor)
     assert torn_off.force == 0.0
-
-
-def test_a_closed_cycle_takes_energy_out():
-    t = np.linspace(0.0, 1.0, 20001)
-    depth, rate = 3e-4 * np.sin(math.pi * t) ** 2, 3e-4 * math.pi * np.sin(2 * math.pi * t)
-    force = [elastic_contact(d, PLANE, R, K, depth_rate=v, damping=0.3).force for d, v in zip(depth, rate, strict=True)]
-    elastic = [elastic_contact(d, PLANE, R, K).force for d in depth]
-    assert np.trapezoid(np.array(force) * rate, t) > 0.0
-    assert np.trapezoid(np.array(elastic) * rate, t) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_no_contact_without_depth():

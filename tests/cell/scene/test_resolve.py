@@ -1,24 +1,19 @@
-"""A scene becomes a setup in SI units in one place, and nobody behind it reads the scene."""
+"""A scene becomes a setup in SI units in one place."""
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scenes import change
 
-import canprobe
-from canprobe.cell.scene.load import load_scene, packaged, packaged_files, parse_scene
+from canprobe.cell.scene.load import load_scene, packaged_files, parse_scene
 from canprobe.cell.scene.model import ObjectSettings
 from canprobe.cell.scene.resolve import resolve
-from canprobe.cell.scene.setup import Calibrate, Free, Listen, Touch
+from canprobe.cell.scene.setup import Touch
 from canprobe.errors import PlanError, SceneError
-
-PACKAGE = Path(canprobe.__file__).parent
 
 
 def test_millimetres_degrees_and_kilopascals_become_si():
@@ -46,55 +41,11 @@ def test_millimetres_degrees_and_kilopascals_become_si():
     assert setup.compute_ns == 150_000
 
 
-@pytest.mark.parametrize("name", [name for name, _ in packaged("scene")])
-def test_a_task_holds_the_hardware_of_its_setup(name):
-    setup = resolve(load_scene(name))
-    for part in ("arm", "array", "probe"):
-        if hasattr(setup.task, part):
-            assert getattr(setup.task, part) is getattr(setup, part)
-    kinds = {"scan": Touch, "press": Touch, "calibrate": Calibrate, "listen": Listen, "free": Free}
-    assert type(setup.task) is kinds[setup.kind]
-    assert setup.emulates == bool(setup.scene.emulated_node_ids)
-
-
-def test_other_hardware_reaches_the_task():
-    setup = resolve(load_scene("cylinder")).changed("array", mode="features").changed("arm", grouped=True)
-    assert setup.task.array is setup.array and setup.array.mode == "features"
-    assert setup.task.arm is setup.arm and setup.arm.grouped is True
-
-
-def test_what_the_plan_chose_stands_in_the_scene_that_a_run_writes():
-    scene = change(load_scene("cylinder"), sensor={"mode": "auto"}, bus={"fd": "auto"}, arm={"grouped_rpdo": "auto"})
-    plan = canprobe.plan(scene)
-    assert (plan.setup.array.mode, plan.setup.bus.fd, plan.setup.arm.grouped) == ("window", False, False)
-    closed = plan.scene
-    assert (closed.sensor.mode, closed.bus.fd, closed.arm.grouped_rpdo) == ("window", False, False)
-    assert canprobe.plan(closed).pdos == plan.pdos
-
-
 def test_what_is_no_object():
     rows = ((1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, -1.0))
     wrong = dataclasses.replace(load_scene("cylinder"), object=ObjectSettings("quadric", matrix=rows))
     with pytest.raises(PlanError, match="object: matrix must pass through the origin"):
         resolve(wrong)
-
-
-def test_nobody_behind_it_reads_the_scene():
-    """`Plan.scene` is there for who writes or sends it: sessions, results, bridges, studies, the command line."""
-    wrong = []
-    for room in ("cell/planning", "cell/master", "cell/tasks", "cell/emulated", "mechanics"):
-        for path in sorted((PACKAGE / room).rglob("*.py")):
-            if path.relative_to(PACKAGE) == Path("cell/planning/model.py"):
-                continue
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.ImportFrom) and node.module in (
-                    "canprobe.cell.scene.model",
-                    "canprobe.cell.scene.load",
-                ):
-                    wrong.append(f"{path}:{node.lineno} imports {node.module}")
-                if isinstance(node, ast.Attribute) and node.attr == "scene":
-                    wrong.append(f"{path}:{node.lineno} reads .scene")
-    assert not wrong, "; ".join(wrong)
 
 
 def test_a_scene_starts_in_a_posture_of_its_cell(tmp_path):

@@ -15,33 +15,24 @@ from canprobe.errors import SceneError, UsageError
 PRESS = load_scene("press")
 
 
-@pytest.mark.parametrize("scene", ["press", PRESS], ids=["name", "Scene"])
 @pytest.mark.parametrize(
     ("overrides", "told"),
     [
         ({"scene.seed": 1.5}, r"changed: scene\.seed: expected an integer from 0 to \d+, got 1\.5"),
-        ({"scene.seed": "1"}, r'scene\.seed: .* got "1"'),
-        ({"scene.seed": True}, r"scene\.seed: "),
-        ({"task.duration_s": float("nan")}, r"task\.duration_s: expected a number above 0 up to 86400, got nan"),
         ({"task.force_N": 3}, r"task\.force_N: unknown key; did you mean force_n\?"),
         ({"object": {"kind": "ellipsoid", "semi_axes_mm": 9}}, r"object\.semi_axes_mm: unknown key\n"),
-        ({"object": {"kind": "ellipsoid", "radis_y_mm": 9}}, r"unknown key; did you mean radius_y_mm\?"),
-        ({"tsk.force_n": 3}, r"tsk: unknown section; did you mean task\?"),
         ({"force_n": 3}, r"force_n: unknown section; did you mean task\.force_n\?"),
         ({"rate_hz": 3}, r"did you mean cycle\.rate_hz or sensor\.rate_hz\?"),
-        ({"task": 3}, r"task: expected a section \[task\], got 3"),
         ({"task.force_n.x": 3}, r"task\.force_n: expected a number above 0 .* got \{x = 3\}"),
-        ({"task.force_n": 9}, r"task\.force_n: expected less than limits\.force_max_n = 5, got 9"),
-        ({"task.strategy": "weave"}, r'task\.strategy: only with kind = "scan", got kind = "press"'),
         ({"bus.channel": "a b"}, r'bus\.channel: expected text without spaces, in ASCII, got "a b"'),
         ({"bus.interface": None, "bus.bitrate": 0}, r"bus\.bitrate: expected an integer from 10000"),
         ({"task.": 3}, r"overrides: expected a key such as task\.force_n, got 'task\.'"),
         ("gantry", r"overrides: expected values by key such as .* got 'gantry'"),
     ],
 )
-def test_a_value_that_no_file_could_have(scene, overrides, told):
+def test_a_value_that_no_file_could_have(overrides, told):
     with pytest.raises(UsageError, match=told):
-        load_scene(scene, overrides)
+        load_scene("press", overrides)
 
 
 def test_a_changed_scene_is_that_of_a_changed_file(tmp_path):
