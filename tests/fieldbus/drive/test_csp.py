@@ -75,11 +75,19 @@ def test_cia402_56_linear_between_the_syncs(master, plant):
         assert plant.motor_counts(0) == pytest.approx(1000 * part)
 
 
-def test_cia402_56_negative_targets_and_positions(master):
-    master.enable()
+@pytest.mark.parametrize(
+    ("target", "reached", "limited"), [(900, 900, 0), (1100, 1000, 1), (-1100, -500, 1), (1000, 1000, 0)]
+)
+def test_cia402_57_software_limits(drive, target, reached, limited):
+    for sub, limit in ((1, -500), (2, 1000)):
+        assert drive.write(0x607D, sub, limit, 4) == 0
+    master = Master(drive).enable()
+    for _ in range(4):
+        frames = master.cycle(target)
+    assert (position(frames), statusword(frames) >> 11 & 1) == (reached, limited)
     for _ in range(3):
-        frames = master.cycle(-700)
-    assert position(frames) == -700
+        frames = master.cycle(0)
+    assert statusword(frames) >> 11 & 1 == 0
 
 
 @pytest.mark.parametrize(

@@ -123,14 +123,16 @@ def test_cia301_sync_41_no_sync_for_one_and_a_half_periods(bench):
 
 
 def test_cia301_emcy_47_error_register_follows(bench):
-    assert bench.read(0x1001) == 0
-    bench.node.emcy.report(0x2310)
-    bench.node.emcy.report(0x8130)
-    assert bench.read(0x1001) == 0x13
-    bench.node.emcy.clear(0x8130)
-    assert bench.read(0x1001) == 0x03
-    bench.node.emcy.clear(0x2310)
-    assert bench.read(0x1001) == 0x00
+    emcy = bench.node.emcy
+    for act, code, told in (
+        (emcy.report, 0x2310, "1023030000000000"),
+        (emcy.report, 0x8130, "3081130000000000"),
+        (emcy.clear, 0x8130, "0000030000000000"),  # one is left
+        (emcy.clear, 0x2310, "0000000000000000"),
+    ):
+        act(code)
+        assert bench.advance(0) == [(0x85, told)]
+        assert bench.read(0x1001) == int(told[4:6], 16)
 
 
 @pytest.mark.parametrize(
