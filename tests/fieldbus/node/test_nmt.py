@@ -12,12 +12,6 @@ TO = {PRE: [0x80], OP: [0x01], STOPPED: [0x02]}
 READ_1000 = "4000100000000000"
 
 
-def test_cia301_nmt_01_boot_up_then_pre_operational(make_bench):
-    bench = make_bench()
-    assert bench.node.start(0) == [(0x705, b"\0")]
-    assert bench.node.state is PRE
-
-
 @pytest.mark.parametrize("state", [PRE, OP, STOPPED])
 @pytest.mark.parametrize(("command", "goal"), [(0x01, OP), (0x02, STOPPED), (0x80, PRE)])
 @pytest.mark.parametrize("address", [0, 5])

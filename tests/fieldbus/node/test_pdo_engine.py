@@ -108,26 +108,12 @@ def test_cia301_pdo_36_synchronous_rpdo_after_the_window_is_dropped(bench):
         assert bench.send(0x80, "", 12 * MS) == [(0x185, expected)]
 
 
-def test_cia301_pdo_37_all_pdos_of_one_group_go_at_the_same_sync(bench):
-    bench.configure(0x1800, cob_id=0x511, words=[0x20010020], type=2, start=4)
-    bench.configure(0x1801, cob_id=0x512, words=[0x20050040], type=2, start=4)
-    bench.write(0x1019, 0, 240, 1)
-    bench.nmt(0x01)
-    assert sync(bench, 2, 3, 4, 5, 6) == ["", "", "511 512", "", "511 512"]
-
-
 def test_cia301_pdo_38_dummies_fill_room(bench):
     bench.configure(0x1401, cob_id=0x301, words=[0x00040020, 0x20090020], type=1)
     bench.nmt(0x01)
     bench.send(0x301, "ffffffff78563412")
     bench.send(0x80, "")
     assert bench.read(0x2009) == 0x12345678
-
-
-def test_cia301_pdo_unsigned64_entry(bench):
-    bench.configure(0x1801, cob_id=0x512, words=[0x20050040], type=1)
-    bench.nmt(0x01)
-    assert bench.send(0x80, "")[1] == (0x512, "8877665544332211")
 
 
 def test_cia301_pdo_remapped_in_operational(bench):
