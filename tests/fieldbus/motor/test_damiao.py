@@ -82,11 +82,6 @@ def test_it_says_nothing_by_itself_and_answers_every_frame_to_it_once_on_its_mst
     assert master.send(0x002, bytes(8)) == master.send(0x80000001, bytes(8)) == master.send(0x40000001, b"") == []
 
 
-def test_the_factory_setting_answers_on_000h(master):
-    ((can_id, _),) = master.send(1, SPECIAL + b"\xfd")
-    assert can_id == 0
-
-
 def test_enabling_gives_no_torque_before_the_first_command_and_disabling_forgets_it(master):
     assert master.special(Special.ENABLE).status == MotorStatus.ENABLED
     master.wait(100 * MS)

@@ -496,7 +496,6 @@ def test_the_verdict_on_lost_sync_does_not_depend_on_the_points_before(before, w
     [
         (0x285, "", lambda text: text[:-2], "TPDO 285h (1801h) has 3 bytes, its mapping 4"),
         (0x285, "", lambda text: text + "00", "TPDO 285h (1801h) has 5 bytes, its mapping 4"),
-        (0x185, "", lambda text: text[:-2], "TPDO 185h (1800h) has 7 bytes, its mapping 8"),
     ],
 )
 def test_every_tpdo_that_is_heard_is_compared_with_its_mapping(can_id, prefix, change, told, whole_eds):
