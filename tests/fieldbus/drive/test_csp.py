@@ -170,15 +170,6 @@ def test_cia402_56_following_error_inside_the_window_or_short_is_none(drive, pla
     assert drive.node.application.state is S.OPERATION_ENABLED
 
 
-def test_cia402_60f4_following_error_has_the_sign_of_demand_minus_actual(drive, plant):
-    master = Master(drive).enable()
-    plant.stuck = True
-    for _ in range(3):
-        master.cycle(40)
-    assert drive.read(0x60F4) == 40
-    assert drive.read(0x6062) == 40
-
-
 def test_cia402_606c_velocity_and_6077_torque(drive, plant):
     master = Master(drive).enable()
     for k in range(5):
@@ -256,24 +247,6 @@ def test_cia402_59_a_repeated_controlword_does_not_restart_a_drive_that_stopped_
     for _ in range(5):
         master.cycle(0, 0x0F)
     assert drive.node.application.state is S.QUICK_STOP_ACTIVE
-
-
-def test_grouped_controlword_by_event_and_target_by_sync_with_a_dummy(drive, plant):
-    off = 0x80000000
-    orders = [(0x1400, 1, off | 0x201, 4), (0x1600, 0, 0, 1), (0x1600, 1, 0x60400010, 4), (0x1600, 0, 1, 1)]
-    orders += [(0x1400, 2, 255, 1), (0x1400, 5, 250, 2), (0x1400, 1, 0x201, 4)]
-    orders += [(0x1401, 1, off | 0x301, 4), (0x1601, 0, 0, 1), (0x1601, 1, 0x607A0020, 4), (0x1601, 2, 0x00040020, 4)]
-    orders += [(0x1601, 0, 2, 1), (0x1401, 2, 1, 1), (0x1401, 1, 0x301, 4)]
-    for order in orders:
-        assert drive.write(*order) == 0, order
-    drive.nmt(0x01, 0)
-    for word in ("0600", "0700", "0f00"):
-        drive.send(0x201, word)
-    assert drive.node.application.state is S.OPERATION_ENABLED
-    for k in range(1, 5):
-        drive.send(0x80, f"{k:02x}", k * CYCLE)
-        drive.send(0x301, "e803000011223344", k * CYCLE + 1000)
-    assert plant.counts[0] == 1000
 
 
 @pytest.mark.parametrize(

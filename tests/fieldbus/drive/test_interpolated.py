@@ -127,13 +127,6 @@ def test_cia402_74_bit_4_may_come_with_enable_operation(master):
     assert master.rig.bits(12) == (1,)
 
 
-def test_cia402_57_74_software_limits_and_bit_11(master):
-    master.rig.put(_607D_1=-100, _607D_2=400)
-    for _ in range(4):
-        master.cycle(700, ACTIVE)
-    assert (master.rig.counts, master.rig.bits(11)) == (400, (1,))
-
-
 def test_cia402_59_74_silence_of_sync_or_records(master):
     master.rig.put(_200E=4)
     master.cycle(0, ACTIVE)
