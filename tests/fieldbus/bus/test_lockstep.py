@@ -119,12 +119,6 @@ def test_a_deadline_that_never_moves_is_an_error() -> None:
         bus.clock.sleep_until_ns(10)
 
 
-def test_nine_bytes_are_refused() -> None:
-    bus, _ = make_bus()
-    with pytest.raises(BusError, match="can7: LockstepPort sends 9 bytes with 123"):
-        bus.port().send_batch([(0x123, bytes(9))])
-
-
 def test_detached_and_closed_are_silent() -> None:
     node = Scripted({1: [(0x100, b"")]}, {0x080: [(0x181, b"")]})
     bus, seen = make_bus(node)

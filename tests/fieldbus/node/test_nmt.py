@@ -38,15 +38,6 @@ def test_cia301_nmt_04_nothing_is_served_in_initialisation(make_bench):
     assert bench.send(0x605, READ_1000) == [(0x585, "4300100078563412")]
 
 
-def test_cia301_nmt_06_pdos_only_in_operational(bench):
-    assert bench.send(0x80, "") == []
-    bench.send(0x205, "aabbccdd0100")
-    bench.nmt(0x01)
-    assert bench.send(0x80, "") == [(0x185, "04030201feff")]
-    bench.nmt(0x02)
-    assert bench.send(0x80, "") == []
-
-
 def test_foreign_frames_are_not_answered(bench):
     for can_id in (0x606, 0x185, 0x701, 0x586, 0x7FF):
         assert bench.send(can_id, "0000000000000000") == []
