@@ -75,12 +75,6 @@ def test_cia305_lss_66_switch_selective_takes_the_one_address(blank):
     blank.silence()  # it is in configuration already
 
 
-def test_cia305_lss_66_messages_of_another_length_mean_nothing(blank):
-    blank.send(REQUEST, "0401")
-    lss(blank, "5e")
-    blank.silence()
-
-
 def test_cia305_lss_67_identify_remote_slave_within_bounds(blank):
     exact = [VENDOR, PRODUCT, REVISION, REVISION, SERIAL, SERIAL]
 

@@ -68,17 +68,6 @@ def test_cia402_74_records_are_reached_by_a_straight_line_over_60c2(master):
     assert master.half() == 2000
 
 
-def test_cia402_74_a_cycle_without_a_record_holds_the_last(master):
-    master.cycle(0, ACTIVE)
-    master.cycle(1000)
-    master.cycle(1000)
-    master.bench.advance((master.k + 1) * CYCLE)
-    master.k += 1
-    assert master.bench.send(0x80, "", master.k * CYCLE) != []
-    assert master.half() == 1000
-    assert master.rig.bits(12) == (1,)
-
-
 def test_cia402_74_the_record_that_stands_is_followed_when_bit_4_comes(master):
     """As drives do: a master has to write the present position first."""
     for put in ({"_60C1_1": 300}, {"_6040": ACTIVE}, {}):

@@ -87,17 +87,6 @@ def test_cia402_51_transition_16_only_with_options_that_stay(drive, option):
     assert drive.node.application.state is S.QUICK_STOP_ACTIVE
 
 
-@pytest.mark.parametrize(
-    ("mode", "code"),
-    [(m, 0) for m in (0, 1, 6, 8, 9, 10)] + [(m, 0x06090030) for m in (2, 3, 4, 5, 7)] + [(11, 0x06090031)],
-)
-def test_cia402_53_modes_follow_and_only_true_ones_are_taken(drive, mode, code):
-    drive.write(0x6060, 0, 0, 1)
-    assert drive.write(0x6060, 0, mode, 1) == code
-    assert drive.read(0x6061) == (0 if code else mode)
-    assert drive.read(0x6502) == 0x3A1  # PP, homing, CSP, CSV, CST
-
-
 def test_cia402_53_csp_bit_12_and_remote_bit_9(drive):
     bring(drive, S.OPERATION_ENABLED)
     assert drive.read(0x6041) & 0x1200 == 0x1000

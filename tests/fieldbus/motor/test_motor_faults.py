@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.fieldbus import load_eds
 from canprobe.fieldbus.motor.damiao import DamiaoMotor
 from canprobe.fieldbus.motor.protocol import SPECIAL, TYPES, Feedback, MitCommand, MotorStatus, Special
 from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS, FaultyMotor
@@ -46,13 +45,6 @@ def test_motors_hear_their_own_commands_alone(line):
     assert line.feedback(1, MitCommand(p=0.2, kp=50, kd=1).pack(DM4310), ms=500).status == MotorStatus.ENABLED
     assert line.feedback(1).p == pytest.approx(0.2, abs=2e-3)
     assert line.feedback(3).p == pytest.approx(0.0, abs=1e-3)
-
-
-def test_a_motor_stands_beside_a_node(line, emulated_nodes, canopen_network):
-    emulated_nodes("puma260_joint", first_id=5)
-    drive = canopen_network.add_node(5, load_eds("puma260_joint", 5))
-    assert drive.sdo[0x6041].raw == 0x40 | drive.sdo[0x6041].raw
-    assert line.feedback(1).status == MotorStatus.ENABLED
 
 
 def test_a_mute_motor_hears_and_says_nothing(line):

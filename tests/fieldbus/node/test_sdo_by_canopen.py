@@ -30,12 +30,6 @@ def client(bench):
     return made
 
 
-def test_reads_numbers_and_strings(client):
-    assert client.upload(0x1000, 0) == b"\x78\x56\x34\x12"
-    assert client.upload(0x1008, 0) == b"a name longer than seven"
-    assert client.upload(0x2005, 0) == bytes.fromhex("8877665544332211")
-
-
 @pytest.mark.parametrize("block", [False, True], ids=["segmented", "block"])
 @pytest.mark.parametrize("size", [1, 4, 5, 7, 8, 14, 888, 889, 890, 5000])
 def test_writes_and_reads_back(client, block, size):

@@ -230,25 +230,28 @@ def test_on_an_event_and_the_same_again_by_its_seed(line):
     assert answered(1) == answered(1) != answered(2)
 
 
+def polled(server, client):
+    """A client in a thread of its own, while the server looks."""
+    thread = threading.Thread(target=client)
+    thread.start()
+    while thread.is_alive():
+        server.poll(0)
+    thread.join()
+
+
 def test_faults_over_the_control_channel(line):
     with pytest.raises(InterfaceError, match="no process of this user serves nodes there"):
         request_faults("vcan7", ["node 5: mute"])
     with ControlServer("vcan7", line.nodes) as server:
-        done, over = [], threading.Event()
+        done = []
 
         def client():
             done.append(request_faults("vcan7", ["node 5: mute for 2 s"]))
             with pytest.raises(UsageError, match="unknown kind 'mut'"):
                 request_faults("vcan7", ["node 5: mut"])
             done.append(request_faults("vcan7", [], clear=True))
-            over.set()
 
-        thread = threading.Thread(target=client)
-        thread.start()
-        while thread.is_alive():
-            server.poll(line.clock.now_ns())
-        thread.join()
-        assert over.is_set()
+        polled(server, client)
         assert done[0]["thrown"] == done[1]["ended"] == ["mute at node 5, 0.0000 s for 2000.0 ms, 100 %"]
     with pytest.raises(InterfaceError, match="no process of this user serves nodes there"):
         request_faults("vcan7", ["node 5: mute"])
@@ -265,10 +268,7 @@ def test_another_user_throws_no_faults(line, monkeypatch):
         said.append(True)
 
     with ControlServer("vcan8", line.nodes) as server:
-        thread = threading.Thread(target=client)
-        thread.start()
-        while thread.is_alive():
-            server.poll(line.clock.now_ns())
+        polled(server, client)
     assert said and line.nodes.faults == []
 
 
