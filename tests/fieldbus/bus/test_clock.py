@@ -18,7 +18,7 @@ from canprobe.fieldbus.bus.port import Reports
 from canprobe.fieldbus.bus.real.mmsg import Row
 from canprobe.fieldbus.bus.real.python_can import PythonCanPort
 from canprobe.fieldbus.bus.real.socketcan import SocketCanPort, StampClock
-from canprobe.fieldbus.protocol.frames import Frame
+from canprobe.fieldbus.protocol.frames import Frame, pack_sync
 
 
 def test_virtual_time_stands_still_and_jumps() -> None:
@@ -206,6 +206,34 @@ def test_frames_from_before_and_after_the_step_keep_their_times(ms: float, opene
         assert read == came
     for (can_id, _, read_ns), (expected, _, came_ns) in zip(read, came, strict=True):  # never as older than it is
         assert can_id == expected and came_ns <= read_ns <= machine.monotonic.now_ns()
+
+
+@pytest.mark.parametrize("ms", [-300, -0.9, -0.1, 0.3])
+def test_no_step_makes_an_answer_older_than_its_sync(ms: float, opened: Open) -> None:
+    """The clock is set at each moment of a cycle; answers come one by one, other frames come before the SYNC."""
+    steps = {100: "send", 110: "drain", 200: "arrive", 230: "look", 330: "arrive", 350: "look"}
+    steps |= {2440: "arrive", 2499: "drain"}
+    for moment_us in range(0, 2500, 50):
+        machine, sync_ns = Machine(60), 0
+        port, _ = opened(machine)
+        for cycle in range(6):
+            start_ns = 5 * MS + 2_500_000 * cycle
+            at_us = steps if cycle != 3 else {**steps, moment_us + 5: "set"}
+            for us in sorted(at_us):
+                machine.go_on_to(start_ns + 1000 * us)
+                match at_us[us]:
+                    case "set":
+                        machine.set_wall(ms)
+                    case "arrive":
+                        machine.arrive()
+                    case "send":
+                        sync_ns = machine.now_ns()
+                        port.send_batch([pack_sync(None)])
+                    case "drain":
+                        port.drain()
+                    case "look":
+                        assert [read_ns >= sync_ns for _, _, read_ns in port.drain()] == [True], moment_us
+        assert port.counters.clock_steps == 1
 
 
 @pytest.mark.parametrize("ms", [-3_600_000, -300, 300, 3_600_000])

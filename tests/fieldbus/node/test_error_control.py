@@ -77,17 +77,6 @@ def test_cia301_sync_39_counter_overflow_values(bench):
     assert answers == [0x06090030 if value == 1 or value > 240 else 0 for value in range(256)]
 
 
-@pytest.mark.parametrize(
-    ("value", "code"),
-    [(0x81 - 1, 0), (0x40000080, 0x06090030), (0x20000080, 0x06090030), (0x601, 0x06090030), (0x90, 0)],
-)
-def test_cia301_sync_cob_id(bench, value, code):
-    assert bench.write(0x1005, 0, value, 4) == code
-    if not code:
-        bench.nmt(0x01)
-        assert bench.send(value, "") == [(0x185, "04030201feff")]
-
-
 def test_cia301_sync_41_no_sync_for_one_and_a_half_periods(bench):
     bench.write(0x1006, 0, 2000, 4)
     bench.nmt(0x01, 0)

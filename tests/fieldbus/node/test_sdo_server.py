@@ -51,18 +51,6 @@ def test_cia301_sdo_limits_themselves_pass(bench):
     assert [bench.write(0x2000, 0, value, 1) for value in (10, 100)] == [0, 0]
 
 
-def test_cia301_sdo_segmented_upload_bytes(bench):
-    assert bench.ask("40081000" + PAD) == "4108100018000000"  # 24 characters
-    answers = [bench.ask(f"{command}00000000000000") for command in ("60", "70", "60", "70")]
-    assert answers == [
-        "00" + b"a name ".hex(),
-        "10" + b"longer ".hex(),
-        "00" + b"than se".hex(),
-        "19" + b"ven".hex() + PAD,
-    ]
-    assert bench.ask("6000000000000000")[-8:] == "01000405"
-
-
 def test_cia301_sdo_segmented_upload_of_nothing(bench):
     assert bench.ask("40042000" + PAD) == "4104200000000000"
     assert bench.ask("6000000000000000") == "0f00000000000000"

@@ -176,26 +176,6 @@ def test_faults_of_the_encoder_and_the_zero(line):
     assert position() == -70
 
 
-def test_a_stuck_brake_is_found_as_a_following_error(line):
-    line.ask(0, "0105")
-    for request_text in (
-        "2f60600001000000",  # profile position
-        "2365600064000000",
-        "2b6660000a000000",
-        "2381600000100000",
-        "2383600000100000",
-        "2384600000100000",
-    ):
-        line.ask(0x605, request_text)
-    for word in (0x06, 0x07, 0x0F):
-        line.word(word)
-    line.ask(0x605, "237a600000002000")
-    with inject(line.node, "node 5: brake-stuck"):
-        line.word(0x1F)
-        line.heard(1000)
-    assert line.node.node.dictionary.number(0x603F) == 0x8611
-
-
 @pytest.mark.parametrize("name", BUS_FAULTS)
 def test_no_value_of_a_parameter_makes_the_node_raise_and_the_end_leaves_it_as_it_was(line, name):
     line.ask(0, "0105")
