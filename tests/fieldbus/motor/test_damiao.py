@@ -232,12 +232,9 @@ def test_zero_is_set_without_a_jump_and_written_to_flash(master):
     assert abs(master.motor.joint.tau) < 0.1
 
 
-def test_feedback_can_be_asked_for(master):
+def test_feedback_can_be_asked_for_as_it_is_answered_and_without_steps(master):
     ((_, asked),) = master.register(RegisterOp.FEEDBACK, 0)
     assert Feedback.unpack(asked, DM4310).p == pytest.approx(0.5, abs=1e-3)
-
-
-def test_feedback_without_steps_can_be_asked_for(master):
     master.special(Special.ENABLE)
     master.mit(t=0.5)
     master.wait(100 * MS)

@@ -64,33 +64,22 @@ def test_after_a_brown_out_the_motor_is_disabled_and_says_nothing_of_it(line):
     assert line.feedback(1, bytes(8)).status == MotorStatus.DISABLED
 
 
-def test_over_temperature_trips_and_comes_back_until_the_motor_is_cold(line):
-    line.feedback(1)
-    line.bus.inject("motor 1: over-temperature deg_c=130 for 1 s")
-    line.pass_ms(390)
-    assert line.feedback(1, bytes(8)).status == MotorStatus.ENABLED
-    line.pass_ms(20)
-    hot = line.feedback(1, bytes(8))
-    assert (hot.status, hot.t_rotor) == (MotorStatus.ROTOR_OVERTEMPERATURE, 130)
-    clear = SPECIAL + bytes((Special.CLEAR,))
-    line.feedback(1, clear)
-    assert line.feedback(1).status == MotorStatus.ROTOR_OVERTEMPERATURE
-    line.pass_ms(1000)
-    line.feedback(1, clear)
-    assert line.feedback(1).status == MotorStatus.ENABLED
-
-
 @pytest.mark.parametrize(
-    ("name", "delay_ms", "status"),
-    [("over-voltage", 1000, MotorStatus.OVERVOLTAGE), ("under-voltage", 250, MotorStatus.UNDERVOLTAGE)],
+    ("name", "delay_ms", "status", "rotor_deg_c"),
+    [
+        ("over-voltage", 1000, MotorStatus.OVERVOLTAGE, 30),
+        ("under-voltage", 250, MotorStatus.UNDERVOLTAGE, 30),
+        ("over-temperature deg_c=130", 400, MotorStatus.ROTOR_OVERTEMPERATURE, 130),
+    ],
 )
-def test_a_supply_outside_of_its_limits_trips_after_its_delay(line, name, delay_ms, status):
+def test_what_is_outside_of_its_limits_trips_after_its_delay(line, name, delay_ms, status, rotor_deg_c):
     line.feedback(1)
     fault = line.bus.inject(f"motor 1: {name}")
     line.pass_ms(delay_ms - 10)
     assert line.feedback(1, bytes(8)).status == MotorStatus.ENABLED
     line.pass_ms(20)
-    assert line.feedback(1, bytes(8)).status == status
+    tripped = line.feedback(1, bytes(8))
+    assert (tripped.status, tripped.t_rotor) == (status, rotor_deg_c)
     line.bus.end(fault)
     line.feedback(1, SPECIAL + bytes((Special.CLEAR,)))
     assert line.feedback(1).status == MotorStatus.ENABLED

@@ -39,13 +39,6 @@ def test_cia301_heartbeat_44_watched_from_the_first_on_and_loss_reported(bench):
     assert bench.send(0x77F, "05", 1400 * MS) == [(0x85, "0000000000000000")]
 
 
-def test_cia301_heartbeat_44_removed_producer_is_forgotten(bench):
-    bench.write(0x1016, 1, MASTER_250, 4)
-    bench.send(0x77F, "05", 0)
-    bench.write(0x1016, 1, 0, 4)
-    assert bench.node.next_deadline_ns is None
-
-
 def test_cia301_heartbeat_44_the_error_ends_when_the_last_of_two_lost_is_back(bench):
     bench.write(0x1029, 1, 1, 1)
     for sub, node_id in ((1, 127), (2, 126)):
