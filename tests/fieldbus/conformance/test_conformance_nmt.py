@@ -7,8 +7,6 @@ from conformance_bench import ON_BOTH_BUSES
 
 PRE, OP, STOPPED = 0x7F, 0x05, 0x04
 TO = {PRE: 0x80, OP: 0x01, STOPPED: 0x02}
-READ = "4000100000000000"
-DEVICE_TYPE = (0x585, "4300100078563412")
 
 
 @pytest.mark.parametrize("command", [0x81, 0x82])

@@ -12,9 +12,8 @@ from canprobe.fieldbus import load_eds
 from canprobe.fieldbus.drive import IdealAxis, make_drive_node
 
 CYCLE = 10_000_000
-RPDO, TPDO = 0x201, 0x181
+TPDO = 0x181
 SYNC_LOST = (0x81, "0081110000000000")
-EMERGENCY = 0x81
 
 
 class Served:
@@ -26,9 +25,6 @@ class Served:
         self.dictionary = self.bench.node.dictionary
         self.bench.node.start(0)
         self.k = 0
-
-    def has(self, index: int, sub: int = 0) -> bool:
-        return index << 8 | sub in self.dictionary
 
     def wish(self, index: int, sub: int, value: int) -> int:
         """Write what the make may lack, have read-only or limit; its abort code."""
