@@ -178,6 +178,21 @@ def test_cia402_53_6502_is_what_the_eds_has_the_objects_for(plant, without, bits
     assert node.dictionary.values[0x6502 << 8] == bits
 
 
+def test_a_poor_eds_without_the_optional_objects_still_moves(rig):
+    od = deepcopy(load_eds("puma260_joint", 1))
+    for index in [index for index in od if index >= 0x6000]:
+        if index not in (0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x607A, 0x6081, 0x6098, 0x60FF, 0x6071):
+            del od[index]
+    rig.drive.node = make_drive_node(od, 1, 0, rig.plant)
+    rig.drive.node.start(0)
+    rig.put(_1006=2500, _6081=5000).enable(1).put(_607A=300).word(0x1F).run(300)
+    assert rig.counts == 300
+    for mode in (6, 8, 9, 10):
+        rig.put(_6060=mode).word(0x1F).run(5)
+    rig.put(_6040=0x02).run(50)
+    assert rig.drive.read(0x6041) & 0x4F == 0x40
+
+
 def test_cia402_60b0_position_offset_is_added(rig):
     rig.put(_60B0=-30).enable(8).drive.nmt(0x01)
     for _ in range(4):
