@@ -50,11 +50,8 @@ class Bench(SdoWords):
     def now_ns(self) -> int:
         return self.port.clock.now_ns()
 
-    def send(self, can_id: int, text: str = "") -> int:
-        """Send; return when."""
-        t_ns = self.now_ns
+    def send(self, can_id: int, text: str = "") -> None:
         self.port.send_batch([(can_id, bytes.fromhex(text))])
-        return t_ns
 
     def _take(self) -> None:
         self._heard += [Heard(can_id, data.hex(), t_ns) for can_id, data, t_ns in self.port.drain()]
@@ -69,11 +66,9 @@ class Bench(SdoWords):
         assert self._heard, f"{self.name}: nothing within {within_ms} ms"
         return self._heard.pop(0)
 
-    def expect(self, *frames: tuple[int, str], within_ms: float = 0) -> int:
-        """These come next and in this order; return when the last did."""
-        got = [self.next(within_ms) for _ in frames]
-        assert [frame[:2] for frame in got] == list(frames)
-        return got[-1].t_ns
+    def expect(self, *frames: tuple[int, str], within_ms: float = 0) -> None:
+        """These come next and in this order."""
+        assert [self.next(within_ms)[:2] for _ in frames] == list(frames)
 
     def silence(self, ms: float = 10) -> None:
         """Nothing comes."""
@@ -83,11 +78,11 @@ class Bench(SdoWords):
             self._take()
             assert self._heard == []
 
-    def ask(self, text: str, base: int = 0x600) -> str:
+    def ask(self, text: str) -> str:
         """One SDO request; the next frame must be its answer."""
-        self.send(base + self.node_id, text)
+        self.send(0x600 + self.node_id, text)
         heard = self.next()
-        assert heard.can_id == base - 0x80 + self.node_id, heard
+        assert heard.can_id == 0x580 + self.node_id, heard
         return heard.text
 
     def set(self, *orders: tuple[int, int, int, int]) -> None:
@@ -95,8 +90,8 @@ class Bench(SdoWords):
         for order in orders:
             assert self.write(*order) == 0, order
 
-    def nmt(self, command: int) -> int:
-        return self.send(0, bytes((command, self.node_id)).hex())
+    def nmt(self, command: int) -> None:
+        self.send(0, bytes((command, self.node_id)).hex())
 
     def state(self) -> int:
         """NMT state, by guarding; also where SDO is silent."""

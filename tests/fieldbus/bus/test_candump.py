@@ -17,8 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from canprobe.errors import UsageError
-from canprobe.fieldbus import LockstepBus, VirtualClock
-from canprobe.fieldbus.bus.candump import CandumpReader, CandumpWriter, RecordingPort, read_candump
+from canprobe.fieldbus.bus.candump import CandumpReader, CandumpWriter, read_candump
 from canprobe.fieldbus.bus.clock_steps import RecordedBus
 from canprobe.fieldbus.bus.port import ERR_FLAG
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
@@ -217,25 +216,6 @@ def test_time_starts_at_t0_and_ns_are_cut(tmp_path: Path) -> None:
     with CandumpWriter(tmp_path / "x", "can0", t0_ns=5_000_000_000) as writer:
         writer.write(0x80, b"", 5_000_001_999)
     assert (tmp_path / "x").read_text() == "(0000000000.000001) can0 080#\n"
-
-
-def test_recording_port_writes_both_directions(tmp_path: Path) -> None:
-    bus = LockstepBus(VirtualClock(), "can0")
-    one, two = bus.port(), bus.port()
-    with CandumpWriter(tmp_path / "x", "can0") as writer:
-        port = RecordingPort(one, writer.write)
-        port.send_batch([(0x080, b"\1"), (0x201, b"\2")])
-        port.clock.sleep_until_ns(2_500_000)
-        two.send_batch([(0x181, b"\3")])
-        port.wait(3_000_000)
-        assert port.drain() == [(0x181, b"\3", 2_500_000)]
-        port.close()
-    assert (port.channel, two.drain()) == ("can0", [(0x080, b"\1", 0), (0x201, b"\2", 0)])
-    assert [(t, i, d) for t, _, i, d in read_candump(tmp_path / "x")] == [
-        (0, 0x080, b"\1"),
-        (0, 0x201, b"\2"),
-        (2_500_000, 0x181, b"\3"),
-    ]
 
 
 def test_a_torn_last_line_is_passed_over_unless_the_log_should_be_whole(tmp_path):

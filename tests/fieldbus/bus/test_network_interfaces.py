@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import re
-import signal
 import socket
-import subprocess
-import sys
 import threading
 
 import pytest
 from network_buses import bare, group  # noqa: F401
-from patience import patience_s
 
-from canprobe.errors import InterfaceError, UsageError
+from canprobe.errors import UsageError
 from canprobe.fieldbus import MonotonicClock, open_port
 from canprobe.fieldbus.bus.real.adapters import configured_bus
 from canprobe.fieldbus.bus.real.python_can import Echoes
@@ -27,22 +23,6 @@ def frames_of(port, count, clock):
         port.wait(until)
         found += port.drain()
     return [frame[:2] for frame in found]
-
-
-@pytest.mark.realtime
-def test_multicast_ports_hear_each_other_and_never_themselves(group):
-    clock = MonotonicClock()
-    one, two = (open_port("udp_multicast", group, 1_000_000, clock) for _ in range(2))
-    try:
-        sent = [(0x181, b"\x01\x02"), (0x80, b"\x01"), (0x80, b"\x02")]
-        one.send_batch(sent)
-        assert frames_of(two, 3, clock) == sent
-        two.send_batch([(0x80, b"\x01")])  # equal to one of the first port's: another master's SYNC is heard
-        assert frames_of(one, 1, clock) == [(0x80, b"\x01")]
-        assert two.drain() == []
-    finally:
-        one.close()
-        two.close()
 
 
 def test_an_echo_is_taken_once_and_not_for_ever():
@@ -121,53 +101,3 @@ def test_a_wrong_configuration_is_said(bare, monkeypatch, name, value, complaint
     monkeypatch.setenv(name, value)
     with pytest.raises(UsageError, match=complaint):
         configured_bus()
-
-
-class Speaking(Socketcand):
-    """Puts one frame on its bus when a client has opened it, and answers none."""
-
-    def __init__(self, frame=""):
-        super().__init__()
-        self.frame = frame
-        self.heard = threading.Event()
-
-    def answer(self, connection, words):
-        self.said.append(words)
-        if words[0] == "send":
-            self.heard.set()
-            return
-        connection.sendall(b"< ok >")
-        if words[0] == "rawmode" and self.frame:
-            connection.sendall(f"< frame {self.frame} >".encode())
-
-
-def test_can_bridge_joins_two_buses_over_the_network(tmp_path):
-    """python-can's own program, as the README has it; what it cannot do is join multicast, which hears itself."""
-    near, far = Speaking("701 12.5 05"), Speaking()
-    for server in (near, far):
-        server.start()
-    words = [sys.executable, "-m", "can.bridge"]
-    for number, server in ((1, near), (2, far)):
-        words += [f"--bus{number}-interface", "socketcand", f"--bus{number}-channel", "can0"]
-        words += [f"--bus{number}-bus-kwargs", "host=127.0.0.1", f"port={server.port}"]
-    with (tmp_path / "said").open("w+") as said:
-        bridge = subprocess.Popen(words, stdout=said, stderr=said)
-        try:
-            assert far.heard.wait(patience_s(20)), (tmp_path / "said").read_text()
-        finally:
-            bridge.send_signal(signal.SIGINT)
-            bridge.wait(patience_s(20))
-            for server in (near, far):
-                server.listener.close()
-                server.join(10)
-    assert [words for words in far.said if words[0] == "send"] == [["send", "701", "1", "5"]]
-    assert not near.heard.is_set()
-
-
-def test_a_driver_whose_library_is_missing_is_an_interface_error(monkeypatch):
-    def trip(**_):
-        raise NameError("name 'canGetNumberOfChannels' is not defined")  # as kvaser does without canlib
-
-    monkeypatch.setattr("can.Bus", trip)
-    with pytest.raises(InterfaceError, match=r"0: kvaser cannot be opened: CANlib of kvaser.com is not installed"):
-        open_port("kvaser", "0", 1_000_000, MonotonicClock())

@@ -96,14 +96,6 @@ def test_a_batch_arrives_whole_and_in_order(ports: tuple[Port, Port]) -> None:
     assert [(can_id, data) for can_id, data, _ in receive(two, 150)] == batch
 
 
-def test_batches_queue_up_behind_each_other(ports: tuple[Port, Port]) -> None:
-    one, two = ports
-    for k in range(20):
-        one.send_batch([(0x181 + j, bytes([k, j])) for j in range(6)])
-    expected = [(0x181 + j, bytes([k, j])) for k in range(20) for j in range(6)]
-    assert [(can_id, data) for can_id, data, _ in receive(two, 120)] == expected
-
-
 def test_an_empty_batch_is_nothing(ports: tuple[Port, Port]) -> None:
     one, two = ports
     one.send_batch([])
@@ -280,11 +272,6 @@ def test_error_frames_with_classes_are_read_by_them(kind: type[FakeAdapter]) -> 
         port = open_port(bus, "adapter", BITRATE, MonotonicClock())
         assert port.drain() == [] and port.state is ControllerState.BUS_OFF
         assert port.counters.error_frames == 0
-
-
-def test_the_port_names_itself(ports: tuple[Port, Port]) -> None:
-    one, two = ports
-    assert one.channel == two.channel != ""
 
 
 @pytest.mark.parametrize(

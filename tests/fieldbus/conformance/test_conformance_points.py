@@ -1,15 +1,13 @@
-"""The points that `canprobe conform` examines, on a node with every service of CiA 301: all pass, without a note.
+"""The points that `canprobe conform` examines, on a node with every service and on a drive: all pass, without a note.
 
 What only a node of our own must do is in the other modules: the value of a limit, the order of two messages.
 """
 
 from __future__ import annotations
 
-from functools import partial
-
 from defects import write_whole_device
 
-from canprobe.fieldbus import Description, SlaveNode, load_eds
+from canprobe.fieldbus import Description, load_eds, make_eds_node
 from canprobe.fieldbus.tools.conform import POINTS, Examination, ExaminationSettings, WriteList
 from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 from canprobe.fieldbus.tools.reports import Verdict
@@ -23,6 +21,7 @@ GROUPS = {
     "sync": [39, 40, 41],
     "emcy": [42, 43, 47],
     "lss": [66, 67, 68, 69, 70, 73],
+    "drive402": [48, 49, 50, 51, 53, 54, 55],
 }
 LEFT_OUT = {"1 power on"}  # it needs a person
 OTHER_CODES = {"42 empty entry"}  # 1003h:09 is beyond the last sub-index, where 06090011h is as exact
@@ -30,11 +29,12 @@ OTHER_CODES = {"42 empty entry"}  # 1003h:09 is beyond the last sub-index, where
 
 def _make(group, numbers):
     def test(connect, tmp_path):
-        eds = write_whole_device(tmp_path)
+        eds = "puma260_joint" if group == "drive402" else write_whole_device(tmp_path)
         od = load_eds(eds, NODE_ID)
-        bench = connect(SlaveNode(od, NODE_ID, od_of=partial(load_eds, eds))).boot()
+        bench = connect(make_eds_node(od, NODE_ID, eds=eds)).boot()
         times = BenchTimes(slack_s=0.2) if bench.real_time else BenchTimes()
-        settings = ExaminationSettings(written=WriteList.parse("2001h,2002h,reset,history"), times=times)
+        written = WriteList.parse("2001h,2002h,reset,history")
+        settings = ExaminationSettings(written=written, times=times, motion=True)
         points = [point for point in POINTS if point.group == group and point.title not in LEFT_OUT]
         report = Examination(bench.port, NODE_ID, Description(od), settings).run(points)
         assert [(row.name, row.detail) for row in report.rows if row.verdict is not Verdict.PASS] == []

@@ -68,17 +68,6 @@ def test_cia402_74_records_are_reached_by_a_straight_line_over_60c2(master):
     assert master.half() == 2000
 
 
-def test_cia402_74_a_cycle_without_a_record_holds_the_last(master):
-    master.cycle(0, ACTIVE)
-    master.cycle(1000)
-    master.cycle(1000)
-    master.bench.advance((master.k + 1) * CYCLE)
-    master.k += 1
-    assert master.bench.send(0x80, "", master.k * CYCLE) != []
-    assert master.half() == 1000
-    assert master.rig.bits(12) == (1,)
-
-
 def test_cia402_74_the_record_that_stands_is_followed_when_bit_4_comes(master):
     """As drives do: a master has to write the present position first."""
     for put in ({"_60C1_1": 300}, {"_6040": ACTIVE}, {}):
@@ -125,13 +114,6 @@ def test_cia402_74_bit_4_may_come_with_enable_operation(master):
     for _ in range(3):
         master.cycle(0, ACTIVE)
     assert master.rig.bits(12) == (1,)
-
-
-def test_cia402_57_74_software_limits_and_bit_11(master):
-    master.rig.put(_607D_1=-100, _607D_2=400)
-    for _ in range(4):
-        master.cycle(700, ACTIVE)
-    assert (master.rig.counts, master.rig.bits(11)) == (400, (1,))
 
 
 def test_cia402_59_74_silence_of_sync_or_records(master):

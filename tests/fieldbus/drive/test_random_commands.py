@@ -6,29 +6,11 @@ import random
 
 import pytest
 from makes import MAKES, write_eds
-from random_orders import WORDS, live
+from random_orders import WORDS
 
 from canprobe.fieldbus import load_eds
 from canprobe.fieldbus.drive import IdealAxis, make_drive_node
 from canprobe.fieldbus.protocol.cia402 import state_of
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_random_orders(rig, seed):
-    rng = random.Random(seed)
-    rig.drive.nmt(0x01)
-    for _ in range(250):
-        live(rig, rng)
-        assert state_of(rig.drive.read(0x6041)) is rig.drive.node.application.state
-        for index in (0x6061, 0x6062, 0x6064, 0x606B, 0x606C, 0x6077, 0x60F4):
-            rig.drive.read(index)
-    rig.drive.nmt(0x81)
-    rig.put(_6060=6, _6098=37)
-    for word in (0x00, 0x80, 0x06, 0x07, 0x0F, 0x1F, 0x0F):
-        rig.word(word)
-    rig.put(_6060=1, _607A=200).word(0x1F).run(400)  # from the new zero, wherever it is
-    assert rig.bits(10, 11) == (1, 0)
-    assert abs(rig.signed(0x6064) - 200) <= 10
 
 
 @pytest.mark.parametrize("make", [*MAKES, "prbt_joint"])

@@ -1,6 +1,6 @@
 """The drive's finite state automaton, CiA 402-2: what leads from state to state beside the commands, faults.
 
-Every command in every state: tests/fieldbus/conformance/test_conformance_402.py.
+Every command in every state: test_options.py.
 """
 
 from __future__ import annotations
@@ -60,13 +60,6 @@ def test_cia402_52_a_fault_leads_to_fault_from_every_state(drive, state):
     assert (drive.read(0x603F), drive.read(0x1001)) == (0x2310, 0x03)
 
 
-def test_cia402_52_fault_reaction_is_a_state_that_can_be_seen(drive):
-    bring(drive, S.OPERATION_ENABLED)
-    drive.node.application.inject_fault(0x2310)
-    drive.advance(drive.t_ns)
-    assert drive.read(0x6041) & 0x4F == 0x0F
-
-
 def test_cia402_52_fault_reset_needs_a_rising_edge(drive):
     drive.write(0x6040, 0, 0x80, 2)
     fault(drive, 0x2310)
@@ -92,17 +85,6 @@ def test_cia402_51_transition_16_only_with_options_that_stay(drive, option):
     for word in (0x02, 0x0F):
         drive.write(0x6040, 0, word, 2)
     assert drive.node.application.state is S.QUICK_STOP_ACTIVE
-
-
-@pytest.mark.parametrize(
-    ("mode", "code"),
-    [(m, 0) for m in (0, 1, 6, 8, 9, 10)] + [(m, 0x06090030) for m in (2, 3, 4, 5, 7)] + [(11, 0x06090031)],
-)
-def test_cia402_53_modes_follow_and_only_true_ones_are_taken(drive, mode, code):
-    drive.write(0x6060, 0, 0, 1)
-    assert drive.write(0x6060, 0, mode, 1) == code
-    assert drive.read(0x6061) == (0 if code else mode)
-    assert drive.read(0x6502) == 0x3A1  # PP, homing, CSP, CSV, CST
 
 
 def test_cia402_53_csp_bit_12_and_remote_bit_9(drive):

@@ -36,11 +36,6 @@ def velocity(rig, target, cycles=10):
     return rig
 
 
-def test_cia402_factor_group_as_delivered_a_unit_is_a_count(rig):
-    move(rig.enable(1), 500)
-    assert (rig.counts, rig.signed(0x6064)) == (500, 500)
-
-
 @pytest.mark.parametrize(
     ("factors", "scale"),
     [

@@ -82,11 +82,6 @@ def test_it_says_nothing_by_itself_and_answers_every_frame_to_it_once_on_its_mst
     assert master.send(0x002, bytes(8)) == master.send(0x80000001, bytes(8)) == master.send(0x40000001, b"") == []
 
 
-def test_the_factory_setting_answers_on_000h(master):
-    ((can_id, _),) = master.send(1, SPECIAL + b"\xfd")
-    assert can_id == 0
-
-
 def test_enabling_gives_no_torque_before_the_first_command_and_disabling_forgets_it(master):
     assert master.special(Special.ENABLE).status == MotorStatus.ENABLED
     master.wait(100 * MS)
@@ -237,12 +232,9 @@ def test_zero_is_set_without_a_jump_and_written_to_flash(master):
     assert abs(master.motor.joint.tau) < 0.1
 
 
-def test_feedback_can_be_asked_for(master):
+def test_feedback_can_be_asked_for_as_it_is_answered_and_without_steps(master):
     ((_, asked),) = master.register(RegisterOp.FEEDBACK, 0)
     assert Feedback.unpack(asked, DM4310).p == pytest.approx(0.5, abs=1e-3)
-
-
-def test_feedback_without_steps_can_be_asked_for(master):
     master.special(Special.ENABLE)
     master.mit(t=0.5)
     master.wait(100 * MS)

@@ -8,7 +8,6 @@ import struct
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.fieldbus import load_eds
 from canprobe.fieldbus.motor.damiao import DamiaoMotor
 from canprobe.fieldbus.motor.protocol import (
     REGISTER_ID,
@@ -62,13 +61,6 @@ def test_motors_hear_their_own_commands_alone(line):
     assert line.feedback(3).p == pytest.approx(0.0, abs=1e-3)
 
 
-def test_a_motor_stands_beside_a_node(line, emulated_nodes, canopen_network):
-    emulated_nodes("puma260_joint", first_id=5)
-    drive = canopen_network.add_node(5, load_eds("puma260_joint", 5))
-    assert drive.sdo[0x6041].raw == 0x40 | drive.sdo[0x6041].raw
-    assert line.feedback(1).status == MotorStatus.ENABLED
-
-
 def test_a_mute_motor_hears_and_says_nothing(line):
     line.feedback(1)
     fault = line.bus.inject("motor 1: mute")
@@ -86,33 +78,22 @@ def test_after_a_brown_out_the_motor_is_disabled_and_says_nothing_of_it(line):
     assert line.feedback(1, bytes(8)).status == MotorStatus.DISABLED
 
 
-def test_over_temperature_trips_and_comes_back_until_the_motor_is_cold(line):
-    line.feedback(1)
-    line.bus.inject("motor 1: over-temperature deg_c=130 for 1 s")
-    line.pass_ms(390)
-    assert line.feedback(1, bytes(8)).status == MotorStatus.ENABLED
-    line.pass_ms(20)
-    hot = line.feedback(1, bytes(8))
-    assert (hot.status, hot.t_rotor) == (MotorStatus.ROTOR_OVERTEMPERATURE, 130)
-    clear = SPECIAL + bytes((Special.CLEAR,))
-    line.feedback(1, clear)
-    assert line.feedback(1).status == MotorStatus.ROTOR_OVERTEMPERATURE
-    line.pass_ms(1000)
-    line.feedback(1, clear)
-    assert line.feedback(1).status == MotorStatus.ENABLED
-
-
 @pytest.mark.parametrize(
-    ("name", "delay_ms", "status"),
-    [("over-voltage", 1000, MotorStatus.OVERVOLTAGE), ("under-voltage", 250, MotorStatus.UNDERVOLTAGE)],
+    ("name", "delay_ms", "status", "rotor_deg_c"),
+    [
+        ("over-voltage", 1000, MotorStatus.OVERVOLTAGE, 30),
+        ("under-voltage", 250, MotorStatus.UNDERVOLTAGE, 30),
+        ("over-temperature deg_c=130", 400, MotorStatus.ROTOR_OVERTEMPERATURE, 130),
+    ],
 )
-def test_a_supply_outside_of_its_limits_trips_after_its_delay(line, name, delay_ms, status):
+def test_what_is_outside_of_its_limits_trips_after_its_delay(line, name, delay_ms, status, rotor_deg_c):
     line.feedback(1)
     fault = line.bus.inject(f"motor 1: {name}")
     line.pass_ms(delay_ms - 10)
     assert line.feedback(1, bytes(8)).status == MotorStatus.ENABLED
     line.pass_ms(20)
-    assert line.feedback(1, bytes(8)).status == status
+    tripped = line.feedback(1, bytes(8))
+    assert (tripped.status, tripped.t_rotor) == (status, rotor_deg_c)
     line.bus.end(fault)
     line.feedback(1, SPECIAL + bytes((Special.CLEAR,)))
     assert line.feedback(1).status == MotorStatus.ENABLED

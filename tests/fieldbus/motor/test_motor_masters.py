@@ -12,7 +12,7 @@ import can
 import pytest
 
 from canprobe.fieldbus.motor.damiao import DamiaoMotor
-from canprobe.fieldbus.motor.protocol import SPECIAL, TYPES, Feedback, MitCommand, MotorStatus, Rid
+from canprobe.fieldbus.motor.protocol import SPECIAL, TYPES, Feedback, MitCommand, MotorStatus
 from canprobe.fieldbus.tools.emulated_bus import ServedBus
 from canprobe.fieldbus.tools.faults.motor_faults import FaultyMotor
 
@@ -73,27 +73,3 @@ def test_damiao_motor_finds_its_ranges_in_the_registers_and_moves_a_joint(driver
     )
     assert abs(motors[0].joint.q - 0.4) < 5e-3
     assert motors[1].joint.q == 0.0
-
-
-@needs_bustype
-def test_damiao_motor_takes_the_answer_to_a_write_for_feedback(driver, motors):
-    """It knows answers by 33h alone; that to a write has 55h. So its check of a new mode reads the old one."""
-    small, _ = driver
-    assert small.get_register(10, PATIENCE_S) == 1
-    with pytest.raises(RuntimeError, match="expected 3, got 1"):
-        small.ensure_control_mode("VEL")
-    assert motors[0].registers[Rid.CTRL_MODE] == 3, "the motor has it"
-    assert small.get_states()["pos"] == pytest.approx(-12.5 + 25 * 0x0055 / 65535, abs=1e-3), (
-        "its second and third byte"
-    )
-
-
-@needs_bustype
-def test_damiao_motor_enables_a_motor_again_that_lost_its_master(driver, motors):
-    """Its commands clear a lost communication and enable a disabled motor, without anybody asking for it."""
-    small, _ = driver
-    small.set_can_timeout(50)
-    small.enable()
-    waited_for(lambda: motors[0].status is MotorStatus.ENABLED)
-    waited_for(lambda: small.get_states().get("status") == "LOST_COMM", small.request_motor_feedback)
-    waited_for(lambda: motors[0].status is MotorStatus.ENABLED, lambda: small.send_cmd_mit(0.0, 0.0, 0.0, 1.0, 0.0))

@@ -12,12 +12,6 @@ TO = {PRE: [0x80], OP: [0x01], STOPPED: [0x02]}
 READ_1000 = "4000100000000000"
 
 
-def test_cia301_nmt_01_boot_up_then_pre_operational(make_bench):
-    bench = make_bench()
-    assert bench.node.start(0) == [(0x705, b"\0")]
-    assert bench.node.state is PRE
-
-
 @pytest.mark.parametrize("state", [PRE, OP, STOPPED])
 @pytest.mark.parametrize(("command", "goal"), [(0x01, OP), (0x02, STOPPED), (0x80, PRE)])
 @pytest.mark.parametrize("address", [0, 5])
@@ -42,15 +36,6 @@ def test_cia301_nmt_04_nothing_is_served_in_initialisation(make_bench):
     assert bench.node.next_deadline_ns == 1_000
     assert bench.advance(1_000) == [(0x705, "00")]
     assert bench.send(0x605, READ_1000) == [(0x585, "4300100078563412")]
-
-
-def test_cia301_nmt_06_pdos_only_in_operational(bench):
-    assert bench.send(0x80, "") == []
-    bench.send(0x205, "aabbccdd0100")
-    bench.nmt(0x01)
-    assert bench.send(0x80, "") == [(0x185, "04030201feff")]
-    bench.nmt(0x02)
-    assert bench.send(0x80, "") == []
 
 
 def test_foreign_frames_are_not_answered(bench):

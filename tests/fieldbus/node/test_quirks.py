@@ -27,14 +27,6 @@ def quirky(drive, plant):
     return made
 
 
-def test_refused_objects_keep_their_value(quirky):
-    bench, _ = quirky(refuse=(0x60C2, 0x605A))
-    assert bench.write(0x60C2, 1, 50, 1) == REFUSED
-    assert bench.write(0x605A, 0, 6, 2) == REFUSED
-    assert bench.read(0x60C2, 1) == 25
-    assert bench.write(0x605C, 0, 1, 2) == 0
-
-
 def test_a_slow_boot_serves_nothing_before_the_boot_up(quirky):
     bench, sent = quirky(boot_ns=2000 * MS)
     assert sent == []

@@ -10,16 +10,6 @@ from hypothesis import strategies as st
 from canprobe.fieldbus.node.timers import Timers
 
 
-def test_fires_once_at_its_time():
-    fired: list[int] = []
-    timers = Timers(SimpleNamespace())
-    timers.new(fired.append).arm(50)
-    timers.run(49)
-    assert (fired, timers.next_ns) == ([], 50)
-    timers.run(50)
-    assert (fired, timers.next_ns) == ([50], None)
-
-
 def test_rearmed_later_and_earlier():
     fired: list[int] = []
     timers = Timers(SimpleNamespace())

@@ -95,7 +95,7 @@ def test_all_that_can_be_permitted_is_put_back_too():
     assert differing == set()
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_ctrl_c_anywhere_puts_back_what_was_written(seed):
     device = eds_device()
     before = device.values

@@ -176,26 +176,6 @@ def test_faults_of_the_encoder_and_the_zero(line):
     assert position() == -70
 
 
-def test_a_stuck_brake_is_found_as_a_following_error(line):
-    line.ask(0, "0105")
-    for request_text in (
-        "2f60600001000000",  # profile position
-        "2365600064000000",
-        "2b6660000a000000",
-        "2381600000100000",
-        "2383600000100000",
-        "2384600000100000",
-    ):
-        line.ask(0x605, request_text)
-    for word in (0x06, 0x07, 0x0F):
-        line.word(word)
-    line.ask(0x605, "237a600000002000")
-    with inject(line.node, "node 5: brake-stuck"):
-        line.word(0x1F)
-        line.heard(1000)
-    assert line.node.node.dictionary.number(0x603F) == 0x8611
-
-
 @pytest.mark.parametrize("name", BUS_FAULTS)
 def test_no_value_of_a_parameter_makes_the_node_raise_and_the_end_leaves_it_as_it_was(line, name):
     line.ask(0, "0105")
@@ -230,25 +210,28 @@ def test_on_an_event_and_the_same_again_by_its_seed(line):
     assert answered(1) == answered(1) != answered(2)
 
 
+def polled(server, client):
+    """A client in a thread of its own, while the server looks."""
+    thread = threading.Thread(target=client)
+    thread.start()
+    while thread.is_alive():
+        server.poll(0)
+    thread.join()
+
+
 def test_faults_over_the_control_channel(line):
     with pytest.raises(InterfaceError, match="no process of this user serves nodes there"):
         request_faults("vcan7", ["node 5: mute"])
     with ControlServer("vcan7", line.nodes) as server:
-        done, over = [], threading.Event()
+        done = []
 
         def client():
             done.append(request_faults("vcan7", ["node 5: mute for 2 s"]))
             with pytest.raises(UsageError, match="unknown kind 'mut'"):
                 request_faults("vcan7", ["node 5: mut"])
             done.append(request_faults("vcan7", [], clear=True))
-            over.set()
 
-        thread = threading.Thread(target=client)
-        thread.start()
-        while thread.is_alive():
-            server.poll(line.clock.now_ns())
-        thread.join()
-        assert over.is_set()
+        polled(server, client)
         assert done[0]["thrown"] == done[1]["ended"] == ["mute at node 5, 0.0000 s for 2000.0 ms, 100 %"]
     with pytest.raises(InterfaceError, match="no process of this user serves nodes there"):
         request_faults("vcan7", ["node 5: mute"])
@@ -265,10 +248,7 @@ def test_another_user_throws_no_faults(line, monkeypatch):
         said.append(True)
 
     with ControlServer("vcan8", line.nodes) as server:
-        thread = threading.Thread(target=client)
-        thread.start()
-        while thread.is_alive():
-            server.poll(line.clock.now_ns())
+        polled(server, client)
     assert said and line.nodes.faults == []
 
 

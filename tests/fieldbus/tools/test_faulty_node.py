@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
-from pathlib import Path
-
 import pytest
 
 from canprobe.fieldbus import VirtualClock, load_eds, make_eds_node
 from canprobe.fieldbus.bus.virtual.lockstep import LockstepBus, Participant
-from canprobe.fieldbus.tools import faults
 from canprobe.fieldbus.tools.faults import BUS_FAULTS, Fault, FaultyNode
-from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS
 
 MS = 1_000_000
 ID = 0x185
@@ -155,21 +150,3 @@ def test_a_wrong_position_keeps_the_rest_of_the_pdo():
     (before,), (wrong,), (after,) = (node.receive(0x80, b"", t * MS) for t in (1, 3, 7))
     assert before == after == (ID, before[1]) and wrong[0] == ID
     assert wrong[1][:2] + wrong[1][6:] == before[1][:2] + before[1][6:] and wrong[1][2:6] != before[1][2:6]
-
-
-def test_the_same_seed_does_the_same():
-    runs = [played(fault(BUS_FAULTS["drop"], 0, 10, share=0.5, seed=9))[0] for _ in range(2)]
-    assert runs[0] == runs[1]
-    assert runs[0] != played(fault(BUS_FAULTS["drop"], 0, 10, share=0.5, seed=10))[0]
-
-
-SERVICES = ("PDO", "SYNC", "heartbeat", "boot-up", "SDO request", "SDO answer")
-FACTS = {"does", "what", "clause", "reaction", "trips", "fails", "frames", "direction", "parameters", "lasts_ms"}
-
-
-def test_the_table_of_kinds_has_only_words_that_are_known():
-    kinds = tomllib.loads(Path(faults.__file__).with_name("kinds.toml").read_text(encoding="utf-8"))
-    for name, facts in kinds.items():
-        assert set(facts) <= FACTS and facts.get("does", "drop") in {**BUS_FAULTS, **MOTOR_FAULTS}, name
-        assert facts.get("frames", "PDO") in SERVICES and facts.get("direction", "in") in ("in", "either"), name
-        assert all(one["low"] <= one["default"] <= one["high"] for one in facts.get("parameters", {}).values()), name

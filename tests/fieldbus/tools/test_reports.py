@@ -223,18 +223,6 @@ def test_the_verdict_comes_in_some_lines():
     ]
 
 
-def test_a_page_without_a_failure_has_no_alarm(tmp_path):
-    write_html(Report("conform", "x", rows=[ReportRow("sdo", "1", Verdict.PASS)]), tmp_path / "report.html")
-    text = (tmp_path / "report.html").read_text()
-    assert '<span class="none">0 fail</span>' in text and '<span class="none">0 error</span>' in text
-    assert 'class="fail"' not in text and '<span class="pass">1 pass</span>' in text
-    write_html(example(), tmp_path / "report.html")
-    page = Page(tmp_path / "report.html")
-    (at,) = (n for n, text in enumerate(page.texts) if text.startswith(" sdo 11 below min: the write of a value"))
-    assert page.texts[at - 1] == "FAIL" and at < page.texts.index("Device and bench")
-    assert '<span class="fail">1 fail</span>' in (tmp_path / "report.html").read_text()
-
-
 def test_the_exit_status_is_the_worst_that_was_found():
     rows = {verdict: ReportRow("sdo", verdict, verdict) for verdict in Verdict}
     for verdicts, status in (("", 0), ("PASS NOT APPLICABLE", 0), ("PASS ERROR", 3), ("ERROR FAIL", 1)):
