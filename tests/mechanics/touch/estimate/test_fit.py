@@ -48,9 +48,12 @@ RUNS = {"ml": (40, 1.25, 7), "recursive": (16, 1.4, 3)}
 """Runs of a method, its largest RMS error against the bound, and runs that a 95 % region may miss."""
 
 
-@pytest.mark.parametrize("method", RUNS)
-@pytest.mark.parametrize("name", ["cylinder", "ellipsoid"])
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [("ellipsoid", "ml"), ("small sphere", "ml"), ("ellipsoid", "recursive"), ("cylinder", "recursive")],
+)
 def test_it_reaches_the_bound_and_covers(name, method, truth):
+    """On a ball of 5 mm the noise of the points is felt in the normals: κ σ_p is 4 mrad against 1 mrad of σ_n."""
     path, (seeds, largest, missed) = truth.path(name), RUNS[method]
     noise = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
     bound = math.sqrt(float(WEIGHT @ np.diag(cramer_rao(path.points, path.normals, path.surface, **noise))))
@@ -77,16 +80,6 @@ def test_it_reaches_the_bound_and_covers(name, method, truth):
         assert np.mean(innovation) == pytest.approx(1.0, abs=0.06)
         K = path.surface.curvature_at(path.points[-1])[0]
         assert bound < 0.05 * np.linalg.norm(K)
-
-
-def test_tight_curvature_needs_the_points_noise_in_the_normals(truth):
-    """R = 5 mm: κ σ_p is 4 mrad against 1 mrad of σ_n."""
-    path = truth.path("small sphere")
-    noise = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
-    bound = math.sqrt(float(WEIGHT @ np.diag(cramer_rao(path.points, path.normals, path.surface, **noise))))
-    errors = [path.error(fit_surface(*path.noisy(2e-5, 1e-3, seed), **noise)) for seed in range(40)]
-    assert math.sqrt(np.mean([frobenius(e) ** 2 for e in errors])) < 1.25 * bound
-    assert frobenius(np.mean(errors, axis=0)) < 0.4 * bound
 
 
 @pytest.mark.parametrize("method", ["chord", "chen1996"])

@@ -72,21 +72,6 @@ def test_at_rest_nothing_is_added_and_never_more_than_the_most():
     assert abs(moved(1.0, 2.0)[0]) < LAG.most
 
 
-def test_it_comes_close_to_a_pad_with_play():
-    """A centroid that a loop of 60 µm drags behind on a weave: most of the lag is gone, whatever the phase."""
-    t = np.arange(0.0, 6.0, 0.005)
-    true = 0.45e-3 * np.stack([np.sin(1.6 * t), np.cos(1.0 * t)], axis=1)
-    pad, centre, left, before = PadLag(LAG), true[0].copy(), [], []
-    for k, place in enumerate(true):
-        way = place - centre
-        size = float(np.hypot(*way))
-        centre = centre + way * max(0.0, 1.0 - 60e-6 / max(size, 1e-12))
-        out = pad.step(float(t[k]), *centre.tolist())
-        left.append(out - place)
-        before.append(centre - place)
-    assert np.std(left[200:]) < 0.65 * np.std(before[200:])
-
-
 def test_noise_of_centroids_is_not_taken_for_a_way():
     """At rest little of it gets into the places; a way far beyond the noise is corrected as before."""
     centroids = 60e-6 * np.random.default_rng(3).normal(size=(2000, 2))

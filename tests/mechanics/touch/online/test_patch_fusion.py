@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from image_models import (
     FORCE,
-    HERE_FLOOR,
     NORMAL,
     RADIUS,
     STIFFNESS,
@@ -16,7 +15,6 @@ from image_models import (
     exact,
     model,
     samples,
-    tensor,
 )
 from scipy.optimize import minimize
 
@@ -32,7 +30,6 @@ from canprobe.mechanics.touch import (
     make_estimator,
 )
 from canprobe.mechanics.touch.estimate.observed import CurvatureInformation
-from canprobe.mechanics.touch.online.patch_curvature import MIN_FRAMES
 from canprobe.mechanics.touch.online.patch_fusion import patch_estimate
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
@@ -217,59 +214,6 @@ class TestFusion:
         assert len(believed) > 30
         assert np.abs(np.diff(believed, axis=0)).max() < 0.4
         assert found[-1].contradicted  # nobody believes moments that are 60 % too large
-
-    def test_estimates_along_a_path_that_begins_to_weave_do_not_jump(self):
-        """Axial, then ever wider: motion takes over from the patch within its standard deviation."""
-        x = np.arange(0.0, 0.06, 1.25e-4)
-        line = [(a, max(a - 0.03, 0.0) * 0.15 * math.sin((a - 0.03) / 1e-3)) for a in x]
-        one, K, sigma = estimator(), [], []
-        for i, (a, y) in enumerate(line):
-            one.add(cylinder_touch(a, y, i * 5e-3, True))
-            if i > 160:
-                answer = one.estimate()
-                assert answer.rank == 3
-                ey = answer.T_frame_contact[:3, :2].T @ [0.0, 1.0, 0.0]
-                K.append(ey @ answer.K @ ey)
-                sigma.append(across(answer))
-        assert sigma[-1] < 0.65 * sigma[0]
-        assert np.abs(np.diff(K)).max() < 0.25 * max(sigma)
-        assert np.asarray(K) == pytest.approx(1 / 0.036, abs=1.0)
-
-    def test_regions_of_both_together_cover_the_truth(self):
-        """Motion and floor drawn anew 200 times: 95 % regions, and never worse than either alone."""
-        rng = np.random.default_rng(12)
-        K = tensor(27.8, 0.0, 0.0)
-        T = homogeneous(tangent_rotation(-np.array([0.0, 0.0, 1.0])), np.zeros(3))
-        P = T[:3, :2]
-        k = P.T @ base_tensor(K, np.array([0.0, 0.0, 1.0])) @ P
-        true = np.array([k[0, 0], math.sqrt(2.0) * k[0, 1], k[1, 1]])
-        information = np.array([[1.5, 0.4, 0.0], [0.4, 0.5, 0.1], [0.0, 0.1, 0.25]])
-        root, floor, inside, errors = (
-            np.linalg.inv(np.linalg.cholesky(information)).T,
-            np.linalg.cholesky(HERE_FLOOR),
-            0,
-            [],
-        )
-        for _ in range(200):
-            e1, e2, shear = floor @ rng.standard_normal(3)
-
-            def seen(k, e1=e1, e2=e2, shear=shear):
-                xx, _, yy = exact(k)
-                return xx * (1 + e1), math.sqrt(xx * yy) * shear, yy * (1 + e2)
-
-            patch = PatchCurvature(model())
-            for touch in samples(base_tensor(K, np.array([0.0, 0.0, 1.0])), np.array([0.0, 0.0, 1.0]),
-                                 FORCE, seen, 2 * MIN_FRAMES):  # fmt: skip
-                patch.add(touch)
-            motion = CurvatureInformation(true + root @ rng.standard_normal(3), information)
-            found = patch.fuse(T, motion)
-            off = found.q - true
-            inside += off @ (information + found.patch) @ off < 7.815
-            errors.append([off, motion.q - true, patch.fuse(T).q - true])
-        assert 0.915 <= inside / 200 <= 0.985
-        both, motion_alone, patch_alone = np.sqrt(np.mean(np.square(errors), axis=0))
-        assert np.all(both < 1.02 * motion_alone)
-        assert np.all(both < 1.02 * patch_alone)
 
 
 def test_a_standing_contact_is_answered_by_the_patch_alone_and_a_reset_forgets_both():
