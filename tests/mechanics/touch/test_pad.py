@@ -45,6 +45,12 @@ def test_a_grid_with_two_distances_is_a_list_of_rectangles() -> None:
     assert square.is_grid and square.half_sides_m == pytest.approx([5e-3, 3e-3])
 
 
+def test_a_list_on_a_sphere_covers_it_as_a_grid_does() -> None:
+    grid = Pad(mount_radius_m=0.03)
+    places = np.c_[grid.uv, np.zeros(grid.taxels)]
+    assert Pad(mount_radius_m=0.03, positions=places).areas == pytest.approx(grid.areas)
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.3])
 def test_the_rim_of_a_list_is_its_outermost_taxels(turn: float) -> None:
     """A square of 8 × 8, turned: its outer ring or, where a corner points along a direction, a part of it; no other."""
