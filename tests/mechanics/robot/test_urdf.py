@@ -134,33 +134,6 @@ def test_bodies_make_the_mass_matrix_and_the_height_of_pinocchio(arm):
         assert moments == pytest.approx(gravity[oracle.columns], abs=1e-8)
 
 
-def test_meshes_stand_where_pinocchio_has_them_and_are_found():
-    pin = pytest.importorskip("pinocchio")
-    file, base, tip, _ = ARMS["tiago with its torso"]
-    path = Path(pin.__file__).parents[4] / "share/example-robot-data/robots" / file
-    read, visuals = from_urdf(path, base, tip), visuals_of(path, base, tip)
-    oracle = Oracle(pin, path, read.chain.joints, tip)
-    solids = pin.buildGeomFromUrdf(
-        oracle.model, str(path), pin.GeometryType.VISUAL, package_dirs=[str(path.parents[4])]
-    )
-    q, placed = np.random.default_rng(2).uniform(-1.0, 1.0, read.chain.n), solids.createData()
-    oracle.tool(q, base)
-    pin.updateGeometryPlacements(oracle.model, oracle.data, solids, placed, oracle.q(q))
-    T_base = oracle.data.oMf[oracle.model.getFrameId(base, pin.FrameType.BODY)].inverse()
-    there = [
-        (Path(solid.meshPath).name, (T_base * T).homogeneous)
-        for solid, T in zip(solids.geometryObjects, placed.oMg, strict=True)
-    ]
-    assert len(there) == len(visuals) or base != oracle.model.frames[1].name
-    for visual in (visual for visual in visuals if visual.kind == "mesh"):
-        k, T = visual.joint, visual.T
-        if k:
-            moved = Chain("part", read.chain.joints[:k], read.chain.prismatic[:k], read.chain.fixed[:k], np.eye(4))
-            T = forward(moved, q[:k]) @ T
-        found = find_mesh(path, visual.mesh)
-        assert any(found.name == mesh and np.allclose(T, other, rtol=0, atol=1e-9) for mesh, other in there)
-
-
 # Without the oracle: what a small file means, and what is refused.
 
 LIMIT = '<limit lower="-1" upper="2" velocity="3" effort="4"/>'
@@ -229,19 +202,6 @@ def test_limits_that_look_like_degrees_are_warned_of():
 def test_moments_that_no_body_has_are_warned_of_as_they_can_be_moved():
     (warning,) = from_urdf(weighed("1", "1 1 9")).warnings
     assert "link b, with what it carries: no body has principal moments of inertia of 1, 1, 9 kg m^2, of " in warning
-
-
-@pytest.mark.parametrize(
-    ("file", "tip", "warned"),
-    [
-        ("romeo_description/urdf/romeo_laas_small.urdf", "LAnkleRollCollision_shape", ["LHipPitch_link"]),
-        ("icub_description/robots/icub.urdf", "r_foot_dh_frame", []),
-    ],
-)
-def test_inertias_of_real_robots_are_read(file, tip, warned):
-    pinocchio = pytest.importorskip("pinocchio")
-    found = from_urdf(Path(pinocchio.__file__).parents[4] / "share/example-robot-data/robots" / file, tip=tip)
-    assert [re.search(r"link (\w+), with what", warning)[1] for warning in found.warnings] == warned
 
 
 def test_a_small_file_from_its_text():

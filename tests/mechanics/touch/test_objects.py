@@ -122,20 +122,6 @@ def test_distance_is_the_minimum_found_by_scipy(name, seed):
     assert shape.closest(query).distance == pytest.approx(math.sqrt(best / 1e4), abs=1e-7)
 
 
-@given(
-    radius=st.floats(0.001, 100.0),
-    local=st.tuples(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01), st.floats(0.0, 0.06)).map(np.array),
-)
-def test_a_quadric_of_a_sphere_is_the_sphere(radius, local):
-    matrix = np.diag((1.0, 1.0, 1.0, 0.0))
-    matrix[2, 3] = matrix[3, 2] = radius
-    quadric = make_object("quadric", T_base_object=POSE, matrix=matrix).closest(above(local))
-    sphere = make_object("sphere", T_base_object=POSE, radius=radius).closest(above(local))
-    assert quadric.distance == pytest.approx(sphere.distance, abs=1e-12)
-    assert quadric.point == pytest.approx(sphere.point, abs=1e-12)
-    assert quadric.kappa == pytest.approx(sphere.kappa, rel=1e-9)
-
-
 def test_bowl_is_hollow_above_its_origin_and_has_a_rim():
     bowl = build("bowl")
     side = bowl.closest(above((0.09, 0.0, 0.1)))

@@ -106,24 +106,6 @@ class TestLongRuns:
         assert np.allclose(np.linalg.eigvalsh(after.covariance), np.linalg.eigvalsh(settled.covariance), rtol=0.05)
         assert frobenius(path.error(after)) < 4.0 * math.sqrt(WEIGHT @ np.diag(after.covariance))
 
-    def test_motion_after_long_rest_counts_at_once(self, truth):
-        """2e4 samples of rest from the start (an hour in tests/bench); then all is as without them."""
-        path = truth.path("cylinder")
-        p, n = path.noisy(*SIGMA, 2)
-        fresh = fed(make("recursive"), truth.samples(p, n))
-        rng = np.random.default_rng(1)
-        T, r = np.eye(4), np.array([0.0, 0.0, 0.04])
-        cloud = path.points[0] + SIGMA[0] * rng.normal(size=(5000, 3))
-        estimator = make("recursive")
-        for i in range(20_000):
-            estimator.add(ContactSample(0.005 * i, cloud[i % 5000], path.normals[0], T, r, 1.0))
-        waiting = estimator.estimate()
-        assert waiting is None or not waiting.observed.any()
-        e = fed(estimator, truth.samples(p, n, 0.005 * 20_000))
-        assert e.rank == 3
-        assert np.allclose(np.diag(e.covariance), np.diag(fresh.covariance), rtol=0.3)
-        assert frobenius(path.error(e)) < 4.0 * math.sqrt(WEIGHT @ np.diag(e.covariance))
-
 
 BAD = [
     ({"p_base": math.nan}, "not_finite"),
@@ -202,29 +184,6 @@ class TestOutliers:
             assert not any("changed" in note for note in e.notes)
             worst = max(worst, frobenius(path.error(e)))
         assert worst < 1.0
-
-    def test_online_they_leave_error_and_coverage_as_without_them(self, truth):
-        """5 % of the centroids 5 mm off, all along a run, against the same run without."""
-        path = figure("sphere", truth)
-        squares, inside = {0.0: [], 0.05: []}, []
-        for seed in range(5):
-            for share, errors in squares.items():
-                p, n, _ = with_wrong_centroids(path, share, 5e-3, seed)
-                estimator = make("recursive")
-                for i, sample in enumerate(truth.samples(p, n)):
-                    estimator.add(sample)
-                    if i < 150 or i % 25:
-                        continue
-                    e = estimator.estimate()
-                    assert e.rank == 3
-                    d = path.error(e, path.surface.project(e.point))
-                    errors.append(WEIGHT @ d**2)
-                    if share:
-                        inside.append(d @ np.linalg.solve(e.covariance, d) < 7.815)
-                assert not any("changed" in note for note in e.notes)
-        clean, spoilt = (math.sqrt(np.mean(errors)) for errors in squares.values())
-        assert spoilt < 1.3 * clean
-        assert np.mean(inside) >= 0.9
 
     @pytest.mark.parametrize(("method", "doubt"), [("ml", Doubt.SATURATED), ("recursive", Doubt.DEAD)])
     def test_doubtful_images_count_less_and_are_told(self, method, doubt, truth):

@@ -62,15 +62,6 @@ def test_ml_reaches_the_bound_of_its_noise(truth):
     assert bound > 1.5 * math.sqrt(WEIGHT @ np.diag(white))
 
 
-def test_no_share_is_independent_noise(truth):
-    path = truth.path("ellipsoid")
-    points, normals = path.noisy(5e-5, 3e-3, 1)
-    a = fit_surface(points, normals, **SIGMA, correlation=Correlation(LENGTH, 0.0))
-    b = fit_surface(points, normals, **SIGMA)
-    assert np.allclose(a.K, b.K, rtol=1e-5, atol=1e-4)
-    assert np.allclose(a.covariance, b.covariance, rtol=1e-5)
-
-
 def test_whitening_is_the_inverse_of_the_correlation():
     path = np.cumsum(np.random.default_rng(0).uniform(0.0, 1e-3, 30))
     W = KNOWN.whitener(path)

@@ -45,22 +45,6 @@ def test_it_has_settled_where_the_full_iteration_ends(name, truth):
         assert np.linalg.svd(ratio, compute_uv=False) == pytest.approx(np.ones(9), abs=0.02)
 
 
-def test_wrong_places_do_not_lead_it_astray(truth):
-    for seed in range(8):
-        found = touches(truth, "saddle", seed)
-        rng = np.random.default_rng(seed)
-        wrong = rng.choice(len(found), 6, replace=False)
-        for i in wrong:
-            found[i] = found[i]._replace(point=found[i].point + 5e-3 * rng.normal(size=3))
-        clean = [t for i, t in enumerate(found) if i not in wrong]
-        start = stepwise(found)
-        assert start.steady
-        assert np.count_nonzero(start.solution.weight < 0.1) == 6
-        without = fit(batch_design(start.T, MEMORY, clean), PRIOR.rows(MEMORY))
-        off = without.root @ (start.solution.target - without.c)
-        assert off @ off < 0.2**2
-
-
 def test_isolated_points_stand_out_and_the_others_do_not():
     rng = np.random.default_rng(0)
     x = np.outer(np.arange(60) * 0.125e-3, [0.6, 0.8, 0.0]) + 2e-5 * rng.normal(size=(60, 3))

@@ -33,17 +33,6 @@ def test_it_is_the_sum_over_past_places():
             assert found == pytest.approx(remembered(t[: i + 1], uv[: i + 1]), rel=1e-9, abs=1e-18)
 
 
-def test_a_patch_that_rests_leaves_nothing_and_one_that_has_moved_is_forgotten():
-    memory = PadMemory()
-    for i in range(200):
-        assert memory.add(0.05 * i, 1e-3, -2e-3) == pytest.approx((0.0, 0.0, 0.0), abs=1e-17)
-    moved = [memory.add(10.0 + 0.05 * i, 3e-3, -2e-3)[0] for i in range(4000)]
-    full = 1.0 - np.exp(-10.0 / np.array(TIME_CONSTANTS_S))
-    assert moved[0] == pytest.approx(4e-6 * full.sum(), rel=0.1)
-    assert np.all(np.diff(moved) < 0.0)
-    assert moved[-1] < 0.005 * moved[0]
-
-
 # The centroid's lag on the pad.
 
 LAG = Lag(most=120e-6, reach=200e-6)

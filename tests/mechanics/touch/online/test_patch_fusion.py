@@ -25,12 +25,10 @@ from canprobe.mechanics.touch import (
     PatchFusion,
     Prior,
     Slope,
-    SystematicErrors,
     indentation_from_force,
     make_estimator,
 )
 from canprobe.mechanics.touch.estimate.observed import CurvatureInformation
-from canprobe.mechanics.touch.online.patch_fusion import patch_estimate
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 
@@ -81,54 +79,11 @@ def test_patch_completes_a_straight_path(method, line, alone):
     np.testing.assert_array_equal(both.T_frame_contact, without.T_frame_contact)
 
 
-def test_curvature_known_along_the_path_sharpens_that_across():
-    touches = [cylinder_touch(x, 0.0, 0.0, True) for x, _ in AXIAL[:20]]
-    patch = PatchCurvature(model())
-    for touch in touches:
-        patch.add(touch)
-    alone = patch_estimate(touches[-1], patch, 0.02)
-    both = after_path(AXIAL).estimate()
-    assert across(both) < 0.75 * across(alone)
-
-
-def test_along_a_straight_path_over_a_torus_both_are_right_or_say_so(torus_line):
-    """Diagonally over its tube. Taken for a quadric's, the motion's curvature is 1 1/m off and said to be ±0.1."""
-    held, answers = [], 0
-    for end in (-0.9, 0.9, 1.3):
-        line = torus_line(0.11, 0.04, end, 0.8, length=0.04, samples=320)
-        rng = np.random.default_rng(1)
-        one = estimator("recursive", SystematicErrors(0.02))  # as in the loop
-        for i, (point, normal) in enumerate(zip(*line.felt(2e-5, 1e-3, rng), strict=True)):
-            T = homogeneous(tangent_rotation(-normal), point + (RADIUS - 0.4e-3) * normal)
-            k = T[:3, :2].T @ line.tensor(point) @ T[:3, :2]
-            inner = np.array([0.0, 0.0, RADIUS - 0.4e-3])
-            one.add(ContactSample(5e-3 * i, point, normal, T, inner, FORCE, moments=exact(entries(k))))
-            if i < 160 or i % 10:
-                continue
-            answers += 1
-            e = one.estimate()
-            if e.rank == 3:
-                P = e.T_frame_contact[:3, :2]
-                d = (e.K - P.T @ line.tensor(e.point) @ P)[[0, 0, 1], [0, 1, 1]]
-                held.append(d @ np.linalg.solve(e.covariance, d) < 7.815)
-    assert len(held) > 0.5 * answers
-    assert np.mean(held) > 0.9
-
-
 def across(estimate, direction=(0.0, 1.0, 0.0)):
     """Standard deviation of the curvature across the axis, or along another direction, 1/m."""
     x, y = estimate.T_frame_contact[:3, :2].T @ direction
     weights = np.array([x * x, 2 * x * y, y * y])
     return math.sqrt(weights @ estimate.covariance @ weights)
-
-
-def test_where_the_path_shows_all_curvature_the_patch_hardly_counts():
-    alone, both = (after_path(WEAVE, moments=moments).estimate() for moments in (False, True))
-    assert alone.method == "recursive"
-    assert both.rank == 3
-    assert any(note.endswith("% of the curvature from the patch") for note in both.notes)
-    assert 0.9 * across(alone) < across(both) < across(alone)
-    assert np.linalg.norm(both.K - alone.K) < 0.5 * across(alone)
 
 
 def lies(factor):
