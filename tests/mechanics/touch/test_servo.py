@@ -61,15 +61,6 @@ def test_without_curvature_contact_is_kept_all_the_same():
     assert np.abs(depths).max() < 60e-6  # a seventh of the indentation
 
 
-def test_local_surface_bends_away_from_the_outward_normal_where_convex():
-    local = LocalSurface(np.zeros(3), np.array((0.0, 0.0, 1.0)), SurfaceGains())
-    local.set_curvature(np.diag((20.0, 0.0, 0.0)))
-    local.correct(local.point, local.normal, dt=1e6)
-    foot, normal = local.foot((1e-3, 0.0, 5.0))
-    assert foot == pytest.approx((1e-3, 0.0, -10e-6))
-    assert normal[0] == pytest.approx(0.02, rel=1e-3)
-
-
 def test_a_new_curvature_turns_the_normal_ahead_step_by_step():
     """At once it would turn it by its change times the distance, and a stiff arm with the probe's radius behind it."""
     local = LocalSurface(np.zeros(3), np.array((0.0, 0.0, 1.0)), SurfaceGains(curvature_hz=4.0))

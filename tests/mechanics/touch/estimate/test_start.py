@@ -90,19 +90,6 @@ class TestWork:
         assert 2 <= most <= 4
         assert total <= 4 * (2 * TAKEOVER_SHARE) / 0.025 + 4
 
-    def test_once_the_filter_has_taken_over_there_is_no_batch_any_more(self, truth, evaluations):
-        path = truth.path("ellipsoid")
-        samples = list(truth.samples(*path.noisy(*SIGMA, 0)))
-        estimator = make_estimator("recursive", sigma_point=SIGMA[0], sigma_normal=SIGMA[1])
-        for sample in samples[:100]:
-            estimator.add(sample)
-        assert evaluations
-        evaluations.clear()
-        for sample in samples[100:]:
-            estimator.add(sample)
-            estimator.estimate()
-        assert not evaluations
-
 
 def test_the_first_step_of_a_path_at_pace_is_not_crowded_that_of_a_contact_at_rest_is(truth):
     """Points from before there is a mean are no part of the first step's length; 16 on one spot are believed less."""
