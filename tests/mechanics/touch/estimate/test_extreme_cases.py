@@ -86,25 +86,24 @@ def test_the_unit_of_length_changes_no_answer(method, truth):
         assert other.condition_number == pytest.approx(one.condition_number, rel=1e-5)
 
 
-class TestLongRuns:
-    def test_standing_still_after_a_scan_changes_nothing(self, truth):
-        """1e4 samples (1e6 in tests/bench): nothing is forgotten or made up."""
-        path = truth.path("ellipsoid", T=truth.any_pose(3))
-        estimator = make("recursive")
-        fed(estimator, truth.samples(*path.noisy(*SIGMA, 0)))
-        rng = np.random.default_rng(1)
-        n, T, r = path.normals[-1], np.eye(4), np.array([0.0, 0.0, 0.04])
-        cloud = path.points[-1] + SIGMA[0] * rng.normal(size=(5000, 3))
-        for i in range(10_000):
-            estimator.add(ContactSample(1.0 + 0.005 * i, cloud[i % 5000], n, T, r, 1.0))
-            if i == 999:
-                settled = estimator.estimate()
-        after = estimator.estimate()
-        assert estimator.dropped.total == 0
-        assert_sane(after)
-        assert after.samples == settled.samples
-        assert np.allclose(np.linalg.eigvalsh(after.covariance), np.linalg.eigvalsh(settled.covariance), rtol=0.05)
-        assert frobenius(path.error(after)) < 4.0 * math.sqrt(WEIGHT @ np.diag(after.covariance))
+def test_standing_still_after_a_scan_changes_nothing(truth):
+    """1e4 samples (1e6 in tests/bench): nothing is forgotten or made up."""
+    path = truth.path("ellipsoid", T=truth.any_pose(3))
+    estimator = make("recursive")
+    fed(estimator, truth.samples(*path.noisy(*SIGMA, 0)))
+    rng = np.random.default_rng(1)
+    n, T, r = path.normals[-1], np.eye(4), np.array([0.0, 0.0, 0.04])
+    cloud = path.points[-1] + SIGMA[0] * rng.normal(size=(5000, 3))
+    for i in range(10_000):
+        estimator.add(ContactSample(1.0 + 0.005 * i, cloud[i % 5000], n, T, r, 1.0))
+        if i == 999:
+            settled = estimator.estimate()
+    after = estimator.estimate()
+    assert estimator.dropped.total == 0
+    assert_sane(after)
+    assert after.samples == settled.samples
+    assert np.allclose(np.linalg.eigvalsh(after.covariance), np.linalg.eigvalsh(settled.covariance), rtol=0.05)
+    assert frobenius(path.error(after)) < 4.0 * math.sqrt(WEIGHT @ np.diag(after.covariance))
 
 
 BAD = [

@@ -56,39 +56,38 @@ def test_isolated_points_stand_out_and_the_others_do_not():
     assert (isolation(x[:4], np.full(4, 1e-10)) == 1.0).all()
 
 
-class TestWork:
-    """No sample may cost much more than another: batch evaluations are counted, not timed."""
+@pytest.fixture
+def evaluations(monkeypatch):
+    """Sizes of the batches that are evaluated: work is counted, not timed."""
+    sizes = []
+    linearise = first_stretch.linearise
 
-    @pytest.fixture
-    def evaluations(self, monkeypatch):
-        sizes = []
-        linearise = first_stretch.linearise
+    def counted(c, d):
+        sizes.append(len(d.X))
+        return linearise(c, d)
 
-        def counted(c, d):
-            sizes.append(len(d.X))
-            return linearise(c, d)
+    monkeypatch.setattr(first_stretch, "linearise", counted)
+    return sizes
 
-        monkeypatch.setattr(first_stretch, "linearise", counted)
-        return sizes
 
-    @pytest.mark.parametrize(("way", "pace", "share"), [("weave", 0.125e-3, 0.1), ("straight", 0.02e-3, 0.0)])
-    def test_no_sample_evaluates_the_stretch_more_than_four_times(self, way, pace, share, truth, evaluations):
-        s = np.arange(0.0, 0.6 * MEMORY, pace)
-        y = 2e-3 * np.sin(s / 1e-3) if way == "weave" else 0.0 * s
-        path = truth.placed(truth.surface("cylinder"), s, y)
-        p, n = path.noisy(*SIGMA, 1)
-        rng = np.random.default_rng(2)
-        wrong = rng.random(len(p)) < share
-        p[wrong] += 5e-3 * rng.normal(size=(int(wrong.sum()), 3))
-        estimator = make_estimator("recursive", sigma_point=SIGMA[0], sigma_normal=SIGMA[1])
-        most, total = 0, 0
-        for i, (point, normal) in enumerate(zip(p, n, strict=True)):
-            estimator.add(ContactSample(0.005 * i, point, normal, np.eye(4), np.array([0.0, 0.0, 0.04]), 1.0))
-            most, total = max(most, len(evaluations)), total + len(evaluations)
-            assert max(evaluations, default=0) <= MAX_CONTACTS
-            evaluations.clear()
-        assert 2 <= most <= 4
-        assert total <= 4 * (2 * TAKEOVER_SHARE) / 0.025 + 4
+@pytest.mark.parametrize(("way", "pace", "share"), [("weave", 0.125e-3, 0.1), ("straight", 0.02e-3, 0.0)])
+def test_no_sample_evaluates_the_stretch_more_than_four_times(way, pace, share, truth, evaluations):
+    s = np.arange(0.0, 0.6 * MEMORY, pace)
+    y = 2e-3 * np.sin(s / 1e-3) if way == "weave" else 0.0 * s
+    path = truth.placed(truth.surface("cylinder"), s, y)
+    p, n = path.noisy(*SIGMA, 1)
+    rng = np.random.default_rng(2)
+    wrong = rng.random(len(p)) < share
+    p[wrong] += 5e-3 * rng.normal(size=(int(wrong.sum()), 3))
+    estimator = make_estimator("recursive", sigma_point=SIGMA[0], sigma_normal=SIGMA[1])
+    most, total = 0, 0
+    for i, (point, normal) in enumerate(zip(p, n, strict=True)):
+        estimator.add(ContactSample(0.005 * i, point, normal, np.eye(4), np.array([0.0, 0.0, 0.04]), 1.0))
+        most, total = max(most, len(evaluations)), total + len(evaluations)
+        assert max(evaluations, default=0) <= MAX_CONTACTS
+        evaluations.clear()
+    assert 2 <= most <= 4
+    assert total <= 4 * (2 * TAKEOVER_SHARE) / 0.025 + 4
 
 
 def test_the_first_step_of_a_path_at_pace_is_not_crowded_that_of_a_contact_at_rest_is(truth):

@@ -147,19 +147,6 @@ class TestFusion:
         assert np.linalg.norm(found.q - motion.q) > 0.3
         assert np.linalg.norm(found.q - [-6.0, 0.0, 27.8]) > 0.2
 
-    def test_more_of_the_motion_moves_the_answer_over_without_a_jump(self, touches):
-        patch = self.patch(touches)
-        own = patch.fuse(self.T)
-        q = own.q + np.array([1.5, -1.0, 1.0])
-        answers = [
-            patch.fuse(self.T, CurvatureInformation(q, size * np.diag([1.0, 0.5, 2.0]))).q
-            for size in np.geomspace(1e-4, 1e4, 401)
-        ]
-        assert answers[0] == pytest.approx(own.q, abs=0.01)
-        assert answers[-1] == pytest.approx(q, abs=0.01)
-        assert np.abs(np.diff(answers, axis=0)).max() < 0.05
-        assert np.all(np.diff([np.linalg.norm(a - q) for a in answers]) < 1e-3)
-
     def test_no_jump_where_images_leave_what_the_motion_believes_and_the_calibration(self, touches):
         motion = CurvatureInformation(np.array([-5.0, 0.0, 26.0]), np.diag([4.0, 4.0, 0.5]))
         scales = np.linspace(0.6, 1.6, 401)
