@@ -169,6 +169,12 @@ def jacobian(q):
     return forward_jacobian(UPENN.chain, q, TOOL)[1]
 
 
+def test_exact_inverse_in_the_scan_pose():
+    J = jacobian(ELBOW_FORM)
+    twist = np.array((0.025, -0.01, 0.004, 0.3, -0.2, 0.1))
+    assert J @ damped_step(J, twist) == pytest.approx(twist, abs=1e-12)
+
+
 def test_rates_stay_bounded_and_continuous_through_the_wrist_singularity():
     twist = np.array((0.0, 0.0, 0.0, 0.0, 0.5, 0.5))
     before = None
