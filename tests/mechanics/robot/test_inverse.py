@@ -25,7 +25,6 @@ from canprobe.mechanics.robot.probe_poses import probe_pose, start_posture
 
 TOOL = tool_z_offset(80.0)
 POINT = np.array((-0.120, -0.1225, 0.374))
-BOTH = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 ARMS = {model.name: model for model in (*MODELS.values(), gantry(), scara(), five(), seven())}
 ARMS |= {f"random {n}": model_of(random_chain(np.random.default_rng(n), n), slide=(-0.6, 0.6)) for n in (5, 6, 7, 8)}
 EACH = pytest.mark.parametrize("model", ARMS.values(), ids=ARMS)
@@ -79,52 +78,20 @@ def test_it_comes_back_to_the_posture_that_made_the_pose(model):
             assert not inside or np.abs(free).max() < 1e-6
 
 
-@EACH
-def test_a_path_is_followed_on_one_branch(model):
-    """A straight line of 40 mm, as a task makes it."""
-    rng = np.random.default_rng(6)
-    for _ in range(10):
-        q = model.q_min + rng.uniform(0.3, 0.7, model.n) * (model.q_max - model.q_min)
-        T, J = forward_jacobian(model.chain, q, TOOL)
-        if np.linalg.svd(in_rows(task_rows(model), T[:3, :3], J))[1][-1] < 0.15:
-            continue
-        direction = rng.normal(size=3)
-        for _ in range(20):
-            T[:3, 3] += 0.002 * direction / np.linalg.norm(direction)
-            before, q = q, inverse_near(model, T, TOOL, q, max_move_rad=0.3)
-            assert away(model, q, T) < 2e-9
-            assert np.abs((q - before) / model.radian).max() < 0.15
-
-
-@BOTH
-@pytest.mark.parametrize(
-    "q_deg", [(10, 20, -40, 30, 0.0, 50), (10, 20, -40, 30, 1e-7, 50), (0, 90, -90, 10, 30, 0)], ids=str
-)
-def test_it_reaches_singular_postures_from_beside_them(model, q_deg):
+@pytest.mark.parametrize("q_deg", [(10, 20, -40, 30, 0.0, 50), (0, 90, -90, 10, 30, 0)], ids=str)
+def test_it_reaches_singular_postures_from_beside_them(q_deg):
     q = np.radians(q_deg)
-    found = inverse_near(model, pose(model, q), TOOL, q + np.array((0.01, -0.01, 0.02, 0.01, 0.02, -0.01)))
-    assert away(model, found, pose(model, q)) < 2e-9
-
-
-def test_a_free_wrist_angle_stays_where_it_was_at_the_singularity():
-    q = np.radians((10, 20, -40, 30, 0.0, 50))
-    assert np.degrees(inverse_near(UPENN, pose(UPENN, q), TOOL, q)) == pytest.approx((10, 20, -40, 30, 0, 50), abs=1e-6)
+    found = inverse_near(UPENN, pose(UPENN, q), TOOL, q + np.array((0.01, -0.01, 0.02, 0.01, 0.02, -0.01)))
+    assert away(UPENN, found, pose(UPENN, q)) < 2e-9
 
 
 def test_whole_turns_follow_the_nearby_posture():
     T = pose(UPENN, np.radians((90, 65, 15, -300, 60, 200)))
-    for j4, j6 in ((-300, 200), (-300, -160)):
-        near = np.radians((91, 66, 15, j4 + 2, 60, j6 - 1))
-        assert np.degrees(inverse_near(UPENN, T, TOOL, near))[[3, 5]] == pytest.approx((j4, j6))
+    near = np.radians((91, 66, 15, -298, 60, -161))
+    assert np.degrees(inverse_near(UPENN, T, TOOL, near))[[3, 5]] == pytest.approx((-300, -160))
 
 
-def test_it_crosses_the_workspace_from_a_far_posture():
-    q = np.radians((20.0, 40.0, 30.0, 20.0, 60.0, -40.0))
-    found = inverse_near(UPENN, pose(UPENN, q), TOOL, ELBOW_FORM)
-    assert away(UPENN, found, pose(UPENN, q)) < 2e-9
-
-
-@pytest.mark.parametrize("model", [UPENN, five(), seven()], ids=lambda model: model.name)
+@pytest.mark.parametrize("model", [UPENN, five()], ids=lambda model: model.name)
 def test_out_of_reach_names_the_nearest_pose(model):
     q = 0.5 * (model.q_min + model.q_max) + 0.3
     T = pose(model, q)
@@ -166,28 +133,6 @@ def test_seven_joints_go_back_to_the_posture_of_rest():
     assert inverse_near(model, T, TOOL, other, q_rest=rest) == pytest.approx(rest, abs=1e-6)
 
 
-def test_four_joints_hold_the_position_alone():
-    model, q = scara(), np.array((0.3, 0.8, 0.1, 0.5))
-    T = pose(model, q)
-    T[:3, :3] = np.eye(3)
-    found = inverse_near(model, T, TOOL, q)
-    assert found == pytest.approx(q, abs=1e-8), "whatever orientation is asked for"
-
-
-@pytest.mark.parametrize("offset_mm", [60.0, 80.0, 100.0])
-def test_scan_region_is_reachable_in_the_elbow_form(offset_mm):
-    down, tool = forward(UPENN.chain, ELBOW_FORM), tool_z_offset(offset_mm)
-    worst_j1 = -math.inf
-    for x in (-0.100, -0.120, -0.140):
-        for y in (-0.105, -0.1225, -0.140):
-            for z in (0.364, 0.374):
-                T = down.copy()
-                T[:3, 3] = (x, y, z + 0.040)
-                q = inverse_near(UPENN, T, tool, ELBOW_FORM)
-                worst_j1 = max(worst_j1, q[0])
-    assert 110.0 - math.degrees(worst_j1) == pytest.approx(2.5, abs=0.1)  # published check of the inner corner
-
-
 # Start poses: the probe stands on the surface with its pole against the normal.
 
 
@@ -202,10 +147,9 @@ def test_probe_pose_is_a_rotation_with_the_pole_against_the_normal():
     assert T[:3, 0] @ np.array((1.0, 0.0, 0.0)) > 0.9
 
 
-@BOTH
-def test_start_posture_of_the_default_scan_point(model):
-    q = start_posture(model, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.040, T_flange_probe=TOOL, clearance_m=0.005)
-    T = pose(model, q)
+def test_start_posture_of_the_default_scan_point():
+    q = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.040, T_flange_probe=TOOL, clearance_m=0.005)
+    T = pose(UPENN, q)
     assert T[:3, 3] == pytest.approx(POINT + np.array((0, 0, 0.045)), abs=1e-9)
     assert T[:3, 2] == pytest.approx((0, 0, -1), abs=1e-9)
     assert np.abs(q - ELBOW_FORM).max() < math.radians(10.0)
@@ -265,7 +209,7 @@ def test_fewer_joints_than_rows_come_as_near_as_they_can():
     assert damped_step(J, twist) == pytest.approx(np.linalg.lstsq(J, twist, rcond=None)[0])
 
 
-@pytest.mark.parametrize("smallest", [0.07, 0.04, 0.004])
+@pytest.mark.parametrize("smallest", [0.07, 0.004])
 def test_damping_rises_by_its_law_below_the_threshold(smallest):
     """A Jacobian of known singular values: every direction is damped by λ² = 0.05² (1 - (s / 0.08)²)."""
     rng = np.random.default_rng(3)
@@ -292,28 +236,19 @@ def moved(counts, q=ELBOW_FORM):
     return (forward(UPENN.chain, after) @ TOOL)[:3, 3] - (forward(UPENN.chain, q) @ TOOL)[:3, 3]
 
 
-@pytest.mark.parametrize("lost", [(), (0,), (1,), (2,), (3,), (4,), (5,), (0, 2), (3, 4, 5)])
+@pytest.mark.parametrize("lost", [(), (1,), (4,), (0, 2), (3, 4, 5)])
 def test_the_motors_that_are_left_make_the_move(lost):
     counts = stepped([i not in lost for i in range(6)])
     assert all(counts[i] == 0.0 for i in lost)
     assert moved(counts) == pytest.approx(MOVE, abs=2e-3 * np.linalg.norm(MOVE)), "the arc's second order is left"
 
 
-def test_with_all_motors_no_other_step_turns_the_joints_less():
-    counts = stepped([True] * 6)
-    dq = UPENN.q_per_unit @ counts
-    J = forward_jacobian(UPENN.chain, ELBOW_FORM, TOOL)[1][:3]
-    assert J @ dq == pytest.approx(MOVE, abs=1e-12)
-    with_motors_4_to_6 = UPENN.q_per_unit @ stepped([True] * 3 + [False] * 3)
-    assert np.linalg.norm(dq) < np.linalg.norm(with_motors_4_to_6)
-
-
-@pytest.mark.parametrize("free", [(5,), (3, 4), (0, 3, 4, 5)])
+@pytest.mark.parametrize("free", [(5,), (0, 3, 4, 5)])
 def test_a_move_that_the_motors_cannot_make_is_none(free):
     assert stepped([i in free for i in range(6)]) is None
 
 
-@pytest.mark.parametrize(("bent", "possible"), [(1e-3, False), (0.1, False), (0.4, True)])
+@pytest.mark.parametrize(("bent", "possible"), [(0.1, False), (0.4, True)])
 def test_motors_that_are_badly_placed_for_a_move_are_not_asked(bent, possible):
     """Back along an arm that is nearly stretched out, without the wrist."""
     q = np.array((0.3, 0.4, bent - np.pi / 2, 0.0, 0.2, 0.0))
@@ -324,7 +259,7 @@ def test_motors_that_are_badly_placed_for_a_move_are_not_asked(bent, possible):
     assert counts is None or moved(counts, q) == pytest.approx(back, abs=2e-6)
 
 
-@pytest.mark.parametrize("model", [gantry(), scara(), seven()], ids=lambda model: model.name)
+@pytest.mark.parametrize("model", [gantry(), seven()], ids=lambda model: model.name)
 def test_drives_of_other_arms_make_the_move_too(model):
     q = 0.5 * (model.q_min + model.q_max) + 0.4 * model.radian
     T, J = forward_jacobian(model.chain, q, TOOL)

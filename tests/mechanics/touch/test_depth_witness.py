@@ -38,10 +38,34 @@ def depth(force):
     return D1 * math.sqrt(force)
 
 
-@pytest.mark.parametrize("speed", [0.0, 3e-3, 25e-3, 100e-3])
-def test_a_true_scan_is_never_contradicted(speed):
+def sinking(t, rate=0.1e-3):
+    """Depth of a probe that sinks from 0.5 s on, m."""
+    return depth(2.0) + rate * max(t - 0.5, 0.0)
+
+
+def off(t):
+    """Depth of a probe that moves off from 1 s on, m."""
+    return max(depth(2.0) - 40e-3 * max(t - 1.0, 0.0), 0.0)
+
+
+TRUE = {
+    "at rest": (2.0, 0.0, lambda t: depth(2.0), lambda t: 2.0 + 0.05 * math.sin(40 * t)),
+    "slow": (2.0, 3e-3, lambda t: depth(2.0), lambda t: 2.0 + 0.05 * math.sin(40 * t)),
+    "fast": (2.0, 100e-3, lambda t: depth(2.0), lambda t: 2.0 + 0.05 * math.sin(40 * t)),
+    "it moves out": (2.0, 0.0, lambda t: depth(2.0) - 0.05e-3 * t, lambda t: 2.0),
+    "it moves off and the force falls": (1.1, 0.0, off, lambda t: (off(t) / D1) ** 2),
+    "it goes in as far as its force says": (2.5, 5e-3, sinking, lambda t: (sinking(t, 0.07e-3) / D1) ** 2),
+    "one bad image": (1.2, 25e-3, lambda t: depth(2.0), lambda t: 0.5 if t == 200 * STEP_S else 2.0),
+}
+"""Seconds, speed over the ball, depth and shown force of scans in which nothing is wrong."""
+
+
+@pytest.mark.parametrize("name", TRUE)
+def test_a_true_scan_is_never_contradicted(name):
+    seconds, speed, depth_of, shown_of = TRUE[name]
     witness = DepthWitness(R, holds=speed == 0.0)
-    assert not scan(witness, 2.0, speed, lambda t: depth(2.0), lambda t: 2.0 + 0.05 * math.sin(40 * t))
+    assert not scan(witness, seconds, speed, depth_of, shown_of)
+    assert witness.fall is None
 
 
 def test_the_depth_is_that_of_the_probe():
@@ -68,11 +92,6 @@ def test_a_force_that_does_not_grow_with_the_depth_is_contradicted_before_half_t
     assert times[0] - 1.0 >= CONTRADICTED_S
 
 
-def test_moving_out_is_no_contradiction():
-    witness = DepthWitness(R, holds=True)
-    assert not scan(witness, 2.0, 0.0, lambda t: depth(2.0) - 0.05e-3 * t, lambda t: 2.0)
-
-
 def test_a_better_depth_at_1_n_places_all_contacts_anew():
     witness = DepthWitness(R, holds=True)
     scan(witness, 1.0, 0.0, lambda t: 1.3 * depth(2.0), lambda t: 2.0)
@@ -89,21 +108,6 @@ def test_a_force_that_falls_at_once_is_told_after_its_time(gain):
     assert times[0] == pytest.approx(1.0 + CONTRADICTED_S, abs=2 * STEP_S)
     assert witness.fall.before == pytest.approx(2.0)
     assert witness.fall.within_s == pytest.approx(STEP_S)
-
-
-def test_one_bad_image_is_no_fall():
-    witness = DepthWitness(R)
-    assert not scan(witness, 1.2, 25e-3, lambda t: depth(2.0), lambda t: 0.5 if t == 200 * STEP_S else 2.0)
-    assert witness.fall is None
-
-
-def test_a_probe_that_moves_off_lowers_the_force():
-    witness = DepthWitness(R, holds=True)
-
-    def off(t):
-        return max(depth(2.0) - 40e-3 * max(t - 1.0, 0.0), 0.0)
-
-    assert not scan(witness, 1.1, 0.0, off, lambda t: (off(t) / D1) ** 2)
 
 
 def test_a_hold_that_wanders_aside_is_told():
@@ -172,11 +176,6 @@ def test_a_contact_on_a_flank_does_not_show_the_top():
     assert depths[1] == pytest.approx(depths[0], abs=1e-6)
 
 
-def sinking(t, rate=0.1e-3):
-    """Depth of a probe that sinks from 0.5 s on, m."""
-    return depth(2.0) + rate * max(t - 0.5, 0.0)
-
-
 @pytest.mark.parametrize("speed", [2e-3, 5e-3])
 def test_a_probe_that_sinks_with_its_contacts_is_told_before_the_limit(speed):
     """The array fades, the servo holds what it shows, and each contact lies a little deeper than the last one."""
@@ -185,11 +184,6 @@ def test_a_probe_that_sinks_with_its_contacts_is_told_before_the_limit(speed):
     assert times, "never noticed"
     assert 0.8 * LIMIT < (sinking(times[0]) / D1) ** 2 < LIMIT
     assert witness.force > 0.8 * LIMIT
-
-
-def test_a_probe_that_goes_in_as_far_as_its_force_says_does_not_sink():
-    witness = DepthWitness(R)
-    assert not scan(witness, 2.5, 5e-3, sinking, lambda t: (sinking(t, 0.07e-3) / D1) ** 2)
 
 
 def over_plane(witness, *, tilt=0.0, rate=0.0):

@@ -24,8 +24,8 @@ def pushed(stiffness, kappa, depths, *, zero=0.0, noise=None):
     return fit
 
 
-@pytest.mark.parametrize("kappa", [(0.0, 0.0), (1 / 0.036, 0.0), (20.0, -12.0), (-10.0, -10.0)])
-@pytest.mark.parametrize("stiffness", [2.3e7, 1.27e8, 2.3e9])
+@pytest.mark.parametrize("kappa", [(1 / 0.036, 0.0), (20.0, -12.0)])
+@pytest.mark.parametrize("stiffness", [2.3e7, 2.3e9])
 def test_the_stiffness_that_made_the_force_is_found_whatever_the_zero(stiffness, kappa):
     deepest = indentation_from_force(2.0, stiffness, RADIUS, kappa)
     fit = pushed(stiffness, kappa, np.linspace(0.3, 1.0, 40) * deepest, zero=-0.2)

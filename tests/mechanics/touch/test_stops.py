@@ -14,7 +14,7 @@ def doubt_of(forces, saturated=0.0, target=2.0, felt=True):
     return rest.doubt(target, felt)
 
 
-@pytest.mark.parametrize("swing", [0.1, 0.5, 0.6, 1.5])
+@pytest.mark.parametrize("swing", [0.5, 0.6])
 def test_spread_is_the_standard_deviation(swing):
     forces = 2.0 + swing * np.sin(np.arange(30))
     doubt = doubt_of(forces)

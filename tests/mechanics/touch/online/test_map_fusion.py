@@ -74,15 +74,6 @@ def test_ground_that_contradicts_is_left_out():
     assert joined(answer, KnownCurvature(TO_Q * [40.0, 0.0, 20.0], 0.01 * np.eye(3))) is answer
 
 
-def test_a_straight_path_over_known_ground_observes_all_curvature():
-    straight = estimate_of(line(-10e-3, 10e-3))
-    assert straight.rank == 2
-    both = joined(straight, KnownCurvature(TO_Q * [20.0, 0.0, 20.0], 0.04 * np.eye(3)))
-    assert both.rank == 3 and both.observed.all()
-    np.testing.assert_allclose(both.kappa, 1.0 / RADIUS, atol=0.6)
-    assert math.sqrt(both.covariance[0, 0]) < 0.25
-
-
 def of_map(path):
     found = SurfaceMap(PadLayer(PAD, STIFFNESS), NOISE)
     found.add_samples(list(contacts(path, seed=1)))

@@ -36,8 +36,7 @@ def alone(patch, touches):
     return patch_estimate(touches[-1], patch, 0.02)
 
 
-@pytest.mark.parametrize("spin", [0.0, 0.8, 2.5])
-@pytest.mark.parametrize("off_pole", [(0.0, 0.0), (0.2, -0.1), (-0.05, 0.24)])
+@pytest.mark.parametrize(("spin", "off_pole"), [(0.0, (0.0, 0.0)), (0.8, (0.2, -0.1))])
 def test_curvature_of_a_standing_touch_in_base_whatever_the_pad_s_attitude(spin, off_pole):
     truth = base_tensor(tensor(27.8, -6.0, 0.5))
     touches = samples(truth, NORMAL, FORCE, exact, 20, spin=spin, off_pole=off_pole)
@@ -91,12 +90,11 @@ def moved_from(away, K, patch):
     return found
 
 
-@pytest.mark.parametrize("away", [0.1, 0.2, 0.3])
-def test_a_place_beyond_the_patch_leaves_no_trace_in_its_moments(away):
-    """It is 4 to 12 mm away: an image here shows nothing of it, as its trace is below the level."""
+def test_a_place_beyond_the_patch_leaves_no_trace_in_its_moments():
+    """It is 4 mm away: an image here shows nothing of it, as its trace is below the level."""
     K = base_tensor(tensor(27.8, -6.0, 0.5))
     patch = PatchCurvature(model())
-    found = moved_from(away, K, patch)
+    found = moved_from(0.1, K, patch)
     P = found.T_frame_contact[:3, :2]
     off = np.array(entries(found.K - P.T @ K @ P))
     assert off @ np.linalg.solve(found.covariance, off) < 3.0  # of χ² of 3
@@ -200,7 +198,7 @@ def test_a_mean_of_moments_takes_a_row_of_far_ones_for_a_change_and_a_single_one
     assert mean.moments == pytest.approx((2.0, 0.1, 1.5))
 
 
-@pytest.mark.parametrize("ratio", [0.54, 1.0, 1.85])
+@pytest.mark.parametrize("ratio", [0.54, 1.85])
 def test_a_layer_of_another_stiffness_than_stated_is_found_from_the_touch(ratio):
     """The slope of the touch and its images give stiffness and curvature, and the stiffness lasts."""
     stated = model().with_stiffness(STIFFNESS / ratio)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from image_models import (
     FORCE,
-    HERE_FLOOR,
     NORMAL,
     RADIUS,
     STIFFNESS,
@@ -16,7 +15,6 @@ from image_models import (
     exact,
     model,
     samples,
-    tensor,
 )
 from scipy.optimize import minimize
 
@@ -27,13 +25,10 @@ from canprobe.mechanics.touch import (
     PatchFusion,
     Prior,
     Slope,
-    SystematicErrors,
     indentation_from_force,
     make_estimator,
 )
 from canprobe.mechanics.touch.estimate.observed import CurvatureInformation
-from canprobe.mechanics.touch.online.patch_curvature import MIN_FRAMES
-from canprobe.mechanics.touch.online.patch_fusion import patch_estimate
 from canprobe.mechanics.touch.tangent_frames import homogeneous, tangent_rotation
 
 
@@ -84,54 +79,11 @@ def test_patch_completes_a_straight_path(method, line, alone):
     np.testing.assert_array_equal(both.T_frame_contact, without.T_frame_contact)
 
 
-def test_curvature_known_along_the_path_sharpens_that_across():
-    touches = [cylinder_touch(x, 0.0, 0.0, True) for x, _ in AXIAL[:20]]
-    patch = PatchCurvature(model())
-    for touch in touches:
-        patch.add(touch)
-    alone = patch_estimate(touches[-1], patch, 0.02)
-    both = after_path(AXIAL).estimate()
-    assert across(both) < 0.75 * across(alone)
-
-
-def test_along_a_straight_path_over_a_torus_both_are_right_or_say_so(torus_line):
-    """Diagonally over its tube. Taken for a quadric's, the motion's curvature is 1 1/m off and said to be ±0.1."""
-    held, answers = [], 0
-    for end in (-0.9, 0.9, 1.3):
-        line = torus_line(0.11, 0.04, end, 0.8, length=0.04, samples=320)
-        rng = np.random.default_rng(1)
-        one = estimator("recursive", SystematicErrors(0.02))  # as in the loop
-        for i, (point, normal) in enumerate(zip(*line.felt(2e-5, 1e-3, rng), strict=True)):
-            T = homogeneous(tangent_rotation(-normal), point + (RADIUS - 0.4e-3) * normal)
-            k = T[:3, :2].T @ line.tensor(point) @ T[:3, :2]
-            inner = np.array([0.0, 0.0, RADIUS - 0.4e-3])
-            one.add(ContactSample(5e-3 * i, point, normal, T, inner, FORCE, moments=exact(entries(k))))
-            if i < 160 or i % 10:
-                continue
-            answers += 1
-            e = one.estimate()
-            if e.rank == 3:
-                P = e.T_frame_contact[:3, :2]
-                d = (e.K - P.T @ line.tensor(e.point) @ P)[[0, 0, 1], [0, 1, 1]]
-                held.append(d @ np.linalg.solve(e.covariance, d) < 7.815)
-    assert len(held) > 0.5 * answers
-    assert np.mean(held) > 0.9
-
-
 def across(estimate, direction=(0.0, 1.0, 0.0)):
     """Standard deviation of the curvature across the axis, or along another direction, 1/m."""
     x, y = estimate.T_frame_contact[:3, :2].T @ direction
     weights = np.array([x * x, 2 * x * y, y * y])
     return math.sqrt(weights @ estimate.covariance @ weights)
-
-
-def test_where_the_path_shows_all_curvature_the_patch_hardly_counts():
-    alone, both = (after_path(WEAVE, moments=moments).estimate() for moments in (False, True))
-    assert alone.method == "recursive"
-    assert both.rank == 3
-    assert any(note.endswith("% of the curvature from the patch") for note in both.notes)
-    assert 0.9 * across(alone) < across(both) < across(alone)
-    assert np.linalg.norm(both.K - alone.K) < 0.5 * across(alone)
 
 
 def lies(factor):
@@ -195,19 +147,6 @@ class TestFusion:
         assert np.linalg.norm(found.q - motion.q) > 0.3
         assert np.linalg.norm(found.q - [-6.0, 0.0, 27.8]) > 0.2
 
-    def test_more_of_the_motion_moves_the_answer_over_without_a_jump(self, touches):
-        patch = self.patch(touches)
-        own = patch.fuse(self.T)
-        q = own.q + np.array([1.5, -1.0, 1.0])
-        answers = [
-            patch.fuse(self.T, CurvatureInformation(q, size * np.diag([1.0, 0.5, 2.0]))).q
-            for size in np.geomspace(1e-4, 1e4, 401)
-        ]
-        assert answers[0] == pytest.approx(own.q, abs=0.01)
-        assert answers[-1] == pytest.approx(q, abs=0.01)
-        assert np.abs(np.diff(answers, axis=0)).max() < 0.05
-        assert np.all(np.diff([np.linalg.norm(a - q) for a in answers]) < 1e-3)
-
     def test_no_jump_where_images_leave_what_the_motion_believes_and_the_calibration(self, touches):
         motion = CurvatureInformation(np.array([-5.0, 0.0, 26.0]), np.diag([4.0, 4.0, 0.5]))
         scales = np.linspace(0.6, 1.6, 401)
@@ -217,59 +156,6 @@ class TestFusion:
         assert len(believed) > 30
         assert np.abs(np.diff(believed, axis=0)).max() < 0.4
         assert found[-1].contradicted  # nobody believes moments that are 60 % too large
-
-    def test_estimates_along_a_path_that_begins_to_weave_do_not_jump(self):
-        """Axial, then ever wider: motion takes over from the patch within its standard deviation."""
-        x = np.arange(0.0, 0.06, 1.25e-4)
-        line = [(a, max(a - 0.03, 0.0) * 0.15 * math.sin((a - 0.03) / 1e-3)) for a in x]
-        one, K, sigma = estimator(), [], []
-        for i, (a, y) in enumerate(line):
-            one.add(cylinder_touch(a, y, i * 5e-3, True))
-            if i > 160:
-                answer = one.estimate()
-                assert answer.rank == 3
-                ey = answer.T_frame_contact[:3, :2].T @ [0.0, 1.0, 0.0]
-                K.append(ey @ answer.K @ ey)
-                sigma.append(across(answer))
-        assert sigma[-1] < 0.65 * sigma[0]
-        assert np.abs(np.diff(K)).max() < 0.25 * max(sigma)
-        assert np.asarray(K) == pytest.approx(1 / 0.036, abs=1.0)
-
-    def test_regions_of_both_together_cover_the_truth(self):
-        """Motion and floor drawn anew 200 times: 95 % regions, and never worse than either alone."""
-        rng = np.random.default_rng(12)
-        K = tensor(27.8, 0.0, 0.0)
-        T = homogeneous(tangent_rotation(-np.array([0.0, 0.0, 1.0])), np.zeros(3))
-        P = T[:3, :2]
-        k = P.T @ base_tensor(K, np.array([0.0, 0.0, 1.0])) @ P
-        true = np.array([k[0, 0], math.sqrt(2.0) * k[0, 1], k[1, 1]])
-        information = np.array([[1.5, 0.4, 0.0], [0.4, 0.5, 0.1], [0.0, 0.1, 0.25]])
-        root, floor, inside, errors = (
-            np.linalg.inv(np.linalg.cholesky(information)).T,
-            np.linalg.cholesky(HERE_FLOOR),
-            0,
-            [],
-        )
-        for _ in range(200):
-            e1, e2, shear = floor @ rng.standard_normal(3)
-
-            def seen(k, e1=e1, e2=e2, shear=shear):
-                xx, _, yy = exact(k)
-                return xx * (1 + e1), math.sqrt(xx * yy) * shear, yy * (1 + e2)
-
-            patch = PatchCurvature(model())
-            for touch in samples(base_tensor(K, np.array([0.0, 0.0, 1.0])), np.array([0.0, 0.0, 1.0]),
-                                 FORCE, seen, 2 * MIN_FRAMES):  # fmt: skip
-                patch.add(touch)
-            motion = CurvatureInformation(true + root @ rng.standard_normal(3), information)
-            found = patch.fuse(T, motion)
-            off = found.q - true
-            inside += off @ (information + found.patch) @ off < 7.815
-            errors.append([off, motion.q - true, patch.fuse(T).q - true])
-        assert 0.915 <= inside / 200 <= 0.985
-        both, motion_alone, patch_alone = np.sqrt(np.mean(np.square(errors), axis=0))
-        assert np.all(both < 1.02 * motion_alone)
-        assert np.all(both < 1.02 * patch_alone)
 
 
 def test_a_standing_contact_is_answered_by_the_patch_alone_and_a_reset_forgets_both():
