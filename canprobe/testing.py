@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from canprobe.cell.results.lockstep_cell import LockstepCell
     from canprobe.fieldbus.tools.emulated_bus import EmulatedBus, EmulatedNode
     from canprobe.fieldbus.tools.faults.injection import PlannedFaults
+    from canprobe.fieldbus.tools.faults.motor_faults import FaultyMotor
     from canprobe.fieldbus.tools.judged_bus import JudgedBus
 
 LOCKSTEP, VCAN = "lockstep", "vcan"
@@ -189,10 +190,7 @@ def emulated_nodes(
     A path is looked for beside the test first. Without a name `canprobe_eds` is taken. Of a node that it returns
     ``node[0x6401, 1] = 1234`` sets a value, as the device itself does, and ``node.emcy(0x5000)`` reports an error.
     """
-    if canprobe_bus not in EMULATED_INTERFACES:
-        why = f"emulated nodes would answer beside the devices of {canprobe_bus}"
-        pytest.fail(f"{why}: mark the test hardware, or take --canprobe-bus vcan", pytrace=False)
-    emulated_bus: EmulatedBus = request.getfixturevalue("emulated_bus")
+    emulated_bus = _bus_without_devices(request, canprobe_bus)
 
     def add(*eds: str | Path, first_id: int | None = None) -> list[EmulatedNode]:
         from canprobe.errors import UsageError
@@ -210,6 +208,36 @@ def emulated_nodes(
 
 
 @pytest.fixture
+def emulated_motors(
+    request: pytest.FixtureRequest, canprobe_bus: str, faults: PlannedFaults
+) -> Callable[..., list[FaultyMotor]]:
+    """Puts motors that speak no CANopen on the bus of the test: ``emulated_motors("damiao:dm4310", first_id=1)``.
+
+    Motor 1 answers on 11h, motor 2 on 12h. Of a motor that it returns ``motor.motor.joint`` is what it turns.
+    """
+    emulated_bus = _bus_without_devices(request, canprobe_bus)
+
+    def add(*names: str, first_id: int = 1) -> list[FaultyMotor]:
+        from canprobe.fieldbus.motor.on_bus import motors_on_bus
+        from canprobe.fieldbus.tools.faults.motor_faults import FaultyMotor
+
+        ids = [first_id + n for n in range(len(names))]
+        motors = [FaultyMotor(motor) for motor in motors_on_bus(names, ids, [0x10 + one for one in ids])]
+        emulated_bus.power_on(motors)
+        faults.attach(emulated_bus.inject, emulated_bus.end, motors)
+        return motors
+
+    return add
+
+
+def _bus_without_devices(request: pytest.FixtureRequest, interface: str) -> EmulatedBus:
+    if interface not in EMULATED_INTERFACES:
+        why = f"emulated nodes would answer beside the devices of {interface}"
+        pytest.fail(f"{why}: mark the test hardware, or take --canprobe-bus vcan", pytrace=False)
+    return cast("EmulatedBus", request.getfixturevalue("emulated_bus"))
+
+
+@pytest.fixture
 def canopen_network(emulated_bus: EmulatedBus) -> canopen.Network:
     """A network of canopen-python on the bus of the test; ``pass_time(seconds)`` lets time pass on any bus."""
     return emulated_bus.network()
@@ -219,12 +247,13 @@ def canopen_network(emulated_bus: EmulatedBus) -> canopen.Network:
 def faults(request: pytest.FixtureRequest, canprobe_seed: int) -> Iterator[PlannedFaults]:
     """Throws faults at the emulated nodes of the test; those of markers are thrown when the nodes are powered on."""
     from canprobe.fieldbus.tools.faults.injection import PlannedFaults
+    from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS
 
     if "lockstep_cell" in request.fixturenames:
         from canprobe.cell.emulated.array_faults import CELL_FAULTS as KINDS
     else:
         from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS as KINDS
-    thrown = PlannedFaults(canprobe_seed, KINDS)
+    thrown = PlannedFaults(canprobe_seed, {**MOTOR_FAULTS, **KINDS})
     _record_of(request).faults = thrown
     for marker in reversed(list(request.node.iter_markers("fault"))):
         thrown.inject(*marker.args, **marker.kwargs)

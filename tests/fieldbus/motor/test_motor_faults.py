@@ -8,7 +8,6 @@ import struct
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.fieldbus.motor.damiao import DamiaoMotor
 from canprobe.fieldbus.motor.protocol import (
     REGISTER_ID,
     SPECIAL,
@@ -21,7 +20,7 @@ from canprobe.fieldbus.motor.protocol import (
     Special,
     pack_register,
 )
-from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS, FaultyMotor
+from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS
 
 MS = 1_000_000
 DM4310 = TYPES["dm4310"]
@@ -30,10 +29,9 @@ DM4310 = TYPES["dm4310"]
 class Line:
     """Motors 1 and 3 on a bus, and a port that commands them."""
 
-    def __init__(self, bus):
+    def __init__(self, bus, emulated_motors):
         self.bus, self.port = bus, bus.port()
-        self.motors = [FaultyMotor(DamiaoMotor("dm4310", one, 0x10 + one)) for one in (1, 3)]
-        bus.power_on(self.motors)
+        self.motors = [*emulated_motors("damiao:dm4310"), *emulated_motors("damiao:dm4310", first_id=3)]
 
     def feedback(self, motor_id, data=SPECIAL + b"\xfc", ms=1.0):
         """The only answer to a frame; None where there is none."""
@@ -49,8 +47,8 @@ class Line:
 
 
 @pytest.fixture
-def line(emulated_bus):
-    return Line(emulated_bus)
+def line(emulated_bus, emulated_motors):
+    return Line(emulated_bus, emulated_motors)
 
 
 def test_motors_hear_their_own_commands_alone(line):
@@ -97,6 +95,15 @@ def test_what_is_outside_of_its_limits_trips_after_its_delay(line, name, delay_m
     line.bus.end(fault)
     line.feedback(1, SPECIAL + bytes((Special.CLEAR,)))
     assert line.feedback(1).status == MotorStatus.ENABLED
+
+
+def test_a_fault_that_a_test_plans_waits_for_its_motor(emulated_bus, faults, emulated_motors):
+    faults.inject("motor 2: mute")
+    emulated_motors("damiao:dm4310", first_id=2)
+    port = emulated_bus.port()
+    port.send_batch([(2, SPECIAL + b"\xfc")])
+    emulated_bus.clock.sleep_until_ns(emulated_bus.clock.now_ns() + MS)
+    assert port.drain() == []
 
 
 def test_a_watchdog_trips_although_frames_come_and_the_fault_is_latched(line):
