@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 from patience import patience_s as stretched
+from slow_scene import write_slow_scene
 from waiting import wait_until
 
-from canprobe.cell.scene.load import scenes_folder
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.clock import MonotonicClock
 from canprobe.fieldbus.bus.port import TimedFrame
@@ -84,9 +84,9 @@ class Command:
     def send(self, number: int) -> None:
         self._process.send_signal(number)
 
-    def wait(self) -> int:
+    def wait(self, patience_s: float = PATIENCE_S) -> int:
         """Wait for the end; return the exit status. Nothing may be left of it."""
-        status = self._process.wait(stretched(PATIENCE_S))
+        status = self._process.wait(stretched(patience_s))
         assert self.children == []
         return status
 
@@ -212,19 +212,10 @@ class Bench:
         self.bus = Bus()
         self.start = Starter(folder)
 
-    def scene(self, name: str, *, emulated: bool = True) -> Path:
-        """A packaged scene at 100 Hz, without pictures, and with its nodes left to somebody else if it says so.
-
-        A slow machine must not decide what these tests find: drives wait for 20 SYNCs, and late cycles end no run.
-        """
-        extra = "" if emulated else "emulated = false\n"
-        text = (scenes_folder() / f"{name}.toml").read_text()
-        text = text.replace("[arm]\n", f"[arm]\nmissed_syncs = 20\n{extra}")
-        text = text.replace("[sensor]\n", f"[sensor]\n{extra}rate_hz = 50\n")
-        text = text.replace("[scene]\n", "[outputs]\nfigures = false\n[scene]\n")
-        path = self.folder / f"{name}-{emulated}.toml"
-        path.write_text(f"{text}\n[cycle]\nrate_hz = 100\n[limits]\nlate_cycles_max_percent = 100\n")
-        return path
+    def scene(self, name: str, *, rate_hz: int = 100, emulated: bool = True, eds: str = "", **options: Any) -> Path:
+        """A packaged scene as `write_slow_scene` alters it."""
+        path = self.folder / f"{name}-{rate_hz}-{emulated}-{bool(eds)}.toml"
+        return write_slow_scene(path, name, rate_hz=rate_hz, emulated=emulated, eds=eds, **options)
 
     def results(self, name: str) -> Results:
         return Results(self.folder / name)

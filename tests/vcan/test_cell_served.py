@@ -1,13 +1,15 @@
-"""Emulated nodes in a process of their own, served to whoever comes."""
+"""Emulated nodes in a process of their own, served to whoever comes: `canprobe`, or a master that is not ours."""
 
 from __future__ import annotations
 
 import json
 import signal
+import threading
 from typing import Any
 
 import canopen
 import pytest
+from patience import patience_s
 
 from canprobe.cli import main
 from canprobe.fieldbus.eds.packaged import eds_path
@@ -36,10 +38,57 @@ def test_scan_lists_the_nodes_with_their_identity(served: Any, bench: Any) -> No
         assert node["device_name"] == eds[0x1008].default
 
 
+def test_a_canopen_master_that_is_not_ours(served: Any, vcan0: str) -> None:
+    network = canopen.Network()
+    network.connect(interface="socketcan", channel=vcan0)
+    try:
+        node: Any = network.add_node(3, str(eds_path("puma260_joint")))
+        node.sdo.RESPONSE_TIMEOUT = 2.0
+        for subindex in (1, 2, 3):
+            assert node.sdo[0x1018][subindex].raw == node.object_dictionary[0x1018][subindex].default
+        node.sdo[0x1017].raw = 50
+        assert node.nmt.wait_for_heartbeat(timeout=patience_s(10)) == "PRE-OPERATIONAL"
+        node.nmt.state = "OPERATIONAL"
+        while node.nmt.wait_for_heartbeat(timeout=patience_s(10)) != "OPERATIONAL":
+            pass
+        node.sdo[0x6040].raw = 0x06
+        assert node.sdo[0x6041].raw & 0x6F == 0x21, "ready to switch on"
+        booted = threading.Event()
+        network.subscribe(0x703, lambda can_id, data, t_s: booted.set() if data == b"\0" else None)
+        node.nmt.state = "RESET"
+        assert booted.wait(patience_s(10)), "the boot-up"
+    finally:
+        network.disconnect()
+
+
+@pytest.mark.slow(reason="a second touch on a real bus; the foreign drives are not emulated either")
+def test_a_run_that_emulates_nothing(served: Any, bench: Any) -> None:
+    scene = bench.scene("press", emulated=False)
+    command = bench.start("run", scene, *ON_VCAN0, "--duration", 1, "--out", "results")
+    (line,) = command.end(0)
+    assert line.startswith("warning: sensor.calibration: the array measures in nominal newtons")
+    results = bench.results("results")
+    assert not (bench.folder / "results" / "truth.npz").exists(), "nothing knows the truth about real nodes"
+    assert results.summary["completed"] is True
+    assert results.summary["contact"]["force_target_n"] == 2.0
+    assert results.summary["contact"]["force_measured_rms_error_n"] < 1.0
+    bench.assert_left_safe(results.last, *NODES)
+    assert served.running
+
+
 def test_a_busy_node_id_is_refused(served: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["emulate", "cylinder", "--channel", "vcan0", "--nodes", "16,5"]) == 3
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("canprobe: node 5: is on vcan0 already; its id is busy")
+
+
+@pytest.mark.slow(reason="starts a run to see it refused; emulate is refused alike")
+def test_a_run_whose_emulated_nodes_are_there_already(served: Any, bench: Any) -> None:
+    (line,) = bench.start("run", "press", *ON_VCAN0, "--out", "results").end(3)
+    assert line.startswith("canprobe: node 1: is on vcan0 already; its id is busy")
+    assert "take them as real ones: " in line and "--set arm.emulated=false --set sensor.emulated=false" in line
+    assert "--nodes" not in line
+    assert served.running
 
 
 def test_drives_stop_by_themselves_when_their_master_is_killed(served: Any, bench: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rights import type_as_root
@@ -75,3 +76,24 @@ def test_an_interface_without_fd_says_what_to_type(vcan0: str) -> None:
         pytest.skip(f"{vcan0} carries CAN FD here")
     with pytest.raises(InterfaceError, match=f"ip link set {vcan0} mtu 72"):
         SocketCanPort(vcan0, MonotonicClock(), data_bitrate=FAST)
+
+
+@pytest.mark.slow(reason="a touch over CAN FD on a real bus; in lockstep: tests/cell/integration/test_fd_cell.py")
+def test_the_full_image_beside_the_arm_in_two_processes(bench: Any, fd_channel: str) -> None:
+    scene = bench.scene("press")
+    text = scene.read_text().replace("[sensor]\n", '[sensor]\nmode = "image"\neds = "tactile_array_fd.eds"\n')
+    scene.write_text(f"{text}\n[bus]\nfd = true\n")
+    command = bench.start(
+        "run", scene, "--bus", "socketcan", "--channel", fd_channel, "--duration", 1, "--out", "results"
+    )
+    assert command.end(0) == []
+    results = bench.results("results")
+    assert results.summary["completed"] is True
+    assert results.summary["contact"]["contact_fraction"] == 1.0
+    assert results.summary["contact"]["force_max_n"] < 4.0
+    long = [frame for frame in results.frames if len(frame[3]) > 8]
+    headers = [frame for frame in results.frames if frame[2] == 0x511]
+    assert {frame[2] for frame in long} == {0x512, 0x513, 0x514, 0x515}
+    assert {len(frame[3]) for frame in long} == {64}
+    assert abs(len(long) - 4 * len(headers)) <= 4 and len(headers) > 50
+    assert results.summary["cycle"]["torn_frames"] <= 0.02 * len(headers)

@@ -18,6 +18,7 @@ from canprobe.mechanics.robot.model import joints_to_units
 
 pytestmark = pytest.mark.vcan
 ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
+CELLS = Path(canprobe.__file__).parent / "cells"
 PROGRAM = Path(__file__).parents[1] / "support" / "foreign_drive.py"
 OFF, PRE_OPERATIONAL = 0x40, 0x7F
 SWINGING = 500
@@ -96,7 +97,7 @@ def test_an_arm_of_six_foreign_drives_in_mode_8(bench: Any, foreign: Any) -> Non
 
 
 SCENE = """
-cell = "prbt"
+cell = "{cell}"
 [scene]
 name = "foreign"
 [outputs]
@@ -111,18 +112,33 @@ swing_period_s = 3
 rate_hz = 100
 [limits]
 late_cycles_max_percent = 100
-[joints.prbt_joint_2]
+[joints.{joint}]
 emulated = false
 """
 
 
 @pytest.mark.slow(reason="one foreign drive; the default runs six")
-def test_one_joint_is_foreign_in_mode_7_and_the_emulator_serves_the_others(bench: Any, foreign: Any) -> None:
+@pytest.mark.parametrize(
+    ("cell", "joint", "eds", "mode", "node_id", "position", "word"),
+    [
+        pytest.param(
+            *("puma260", "joint_2", "puma260_joint", 8, 2, 12634, 0x0F),
+            marks=pytest.mark.skipif(not (CELLS / "puma260.toml").is_file(), reason="needs cells with mixed drives"),
+        ),
+        pytest.param(
+            *("prbt", "prbt_joint_2", "prbt_joint", 7, 4, 7000, 0x1F),
+            marks=pytest.mark.skipif(not (CELLS / "prbt.toml").is_file(), reason="needs mode 7 in the master"),
+        ),
+    ],
+)
+def test_one_joint_is_foreign_and_the_emulator_serves_the_others(  # noqa: PLR0917
+    bench: Any, foreign: Any, cell: str, joint: str, eds: str, mode: int, node_id: int, position: int, word: int
+) -> None:
     scene = bench.folder / "foreign.toml"
-    scene.write_text(SCENE)
-    drives = foreign(eds_path("prbt_joint"), 7, {4: 7000})
+    scene.write_text(SCENE.format(cell=cell, joint=joint))
+    drives = foreign(eds_path(eds), mode, {node_id: position})
     command = bench.start("run", scene, *ON_VCAN0, "--out", "results", "--json")
     assert command.end(0) == []
     (seen,) = drives.end().values()
-    assert_swung(seen, 0x1F)
+    assert_swung(seen, word)
     assert json.loads(command.out)["completed"] is True

@@ -62,6 +62,19 @@ def test_streams_are_byte_exact_and_surroundings_are_the_same(tmp_path: Path) ->
 
 
 @needs_vcan
+def test_without_a_command_a_shell_takes_the_lines_of_standard_input(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [*CANPROBE, "vcan"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "SHELL": "/bin/sh"},
+        input=b"pwd; cat /sys/class/net/vcan0/type; tty; exit 5\n",
+        capture_output=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout.decode(), done.stderr) == (5, f"{tmp_path}\n280\nnot a tty\n", b"")
+
+
+@needs_vcan
 def test_the_shell_has_the_terminal(tmp_path: Path) -> None:
     """Echo, job control and Ctrl-C are those of a terminal; ours is as before afterwards."""
     ours, theirs = pty.openpty()
@@ -109,6 +122,14 @@ def test_a_signal_reaches_a_python_command_as_an_interrupt(tmp_path: Path) -> No
     process.send_signal(signal.SIGINT)
     assert process.communicate() == (b"interrupted\n", b"")
     assert process.returncode == 6
+
+
+@needs_vcan
+def test_time_out_ends_command_and_guest(tmp_path: Path) -> None:
+    process = start(tmp_path, "--timeout", "0.5", "--", "sh", "-c", "echo $$; sleep 600")
+    _, err = process.communicate()
+    assert process.returncode == 124
+    assert b"canprobe: vcan: the command was stopped after 0.5 s" in err
 
 
 @needs_guest

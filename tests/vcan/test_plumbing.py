@@ -12,6 +12,9 @@ import pytest
 
 CONFTEST = Path(__file__).parents[1] / "conftest.py"
 SUPPORT = CONFTEST.parent / "support"
+WORKERS = ("-n", "2", "--dist", "loadfile")
+TWO_WORKERS = pytest.mark.slow(reason="the same with two workers, which the suite itself has")
+ALLOWED = pytest.mark.slow(reason="another session of pytest, for skips that are allowed")
 
 ADDED = """
 _has_interface = lambda: False
@@ -118,10 +121,11 @@ def counts(output: str) -> dict[str, int]:
     return {word.rstrip("s"): int(number) for number, word in re.findall(r"(\d+) ([a-z]+)", last)}
 
 
-def test_outcomes_and_texts_come_back(project: Path) -> None:
+@pytest.mark.parametrize("workers", [(), pytest.param(WORKERS, marks=TWO_WORKERS)], ids=["one session", "workers"])
+def test_outcomes_and_texts_come_back(project: Path, workers: tuple[str, ...]) -> None:
     """One that hangs fails by the timer where the vcan is, and the next goes on."""
     (project / "test_hangs.py").write_text(HANGS)
-    status, output = run(project, STAND_IN="runs", CANPROBE_INSTALL="1")
+    status, output = run(project, *workers, STAND_IN="runs", CANPROBE_INSTALL="1")
     assert status == 1
     assert counts(output) == {"passed": 7, "failed": 2, "skipped": 1, "xfailed": 1, "error": 1}
     assert output.count("what is missing is installed") == 1, "CANPROBE_INSTALL=1 installs, once"
@@ -143,10 +147,14 @@ def test_what_the_inner_session_never_reported_is_an_error(project: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("required", "expected"), [("", {"passed": 1, "skipped": 9}), ("1", {"passed": 1, "error": 9})]
+    ("required", "expected", "workers"),
+    [("", {"passed": 1, "skipped": 9}, ()), pytest.param("1", {"passed": 1, "error": 9}, WORKERS, marks=TWO_WORKERS)],
+    ids=["one session", "workers"],
 )
-def test_without_a_vcan_they_are_skipped_loudly_or_fail(project: Path, required: str, expected: dict[str, int]) -> None:
-    status, output = run(project, STAND_IN="none", CANPROBE_NO_SKIPS=required)
+def test_without_a_vcan_they_are_skipped_loudly_or_fail(
+    project: Path, required: str, expected: dict[str, int], workers: tuple[str, ...]
+) -> None:
+    status, output = run(project, *workers, STAND_IN="none", CANPROBE_NO_SKIPS=required)
     assert (status, counts(output)) == (1 if required else 0, expected)
     assert "apt-get install -y something" in output
     assert ("9 tests were NOT RUN" in output) == (not required)
@@ -176,16 +184,33 @@ def test_expected():
 """
 
 
-def test_a_skip_whose_reason_is_not_listed_is_a_failure_where_all_is_installed(project: Path) -> None:
+@pytest.mark.parametrize(
+    ("strict", "workers", "status", "expected"),
+    [
+        pytest.param("", (), 0, {"passed": 1, "skipped": 6, "xfailed": 1}, marks=ALLOWED),
+        (
+            "1",
+            ("--continue-on-collection-errors",),
+            1,
+            {"passed": 1, "skipped": 2, "xfailed": 1, "failed": 1, "error": 3},
+        ),
+        pytest.param(
+            *("1", WORKERS, 1, {"passed": 1, "skipped": 2, "xfailed": 1, "failed": 1, "error": 3}), marks=TWO_WORKERS
+        ),
+    ],
+    ids=["allowed", "one session", "workers"],
+)
+def test_a_skip_whose_reason_is_not_listed_is_a_failure_where_all_is_installed(
+    project: Path, strict: str, workers: tuple[str, ...], status: int, expected: dict[str, int]
+) -> None:
     """By a mark, by a fixture, of a whole file, and by a test where the vcan is."""
     (project / "test_skipped.py").write_text(SKIPPED)
     (project / "test_file.py").write_text("import pytest\npytest.importorskip('no_such_package')\n")
     words = ("test_it.py::test_skipped", "test_skipped.py", "test_file.py", "test_native.py")
-    status, output = run(project, *words, "--continue-on-collection-errors", STAND_IN="runs", CANPROBE_NO_SKIPS="1")
-    assert status == 1
-    assert counts(output) == {"passed": 1, "skipped": 2, "xfailed": 1, "failed": 1, "error": 3}, output
+    ended, output = run(project, *words, *workers, STAND_IN="runs", CANPROBE_NO_SKIPS=strict)
+    assert (ended, counts(output)) == (status, expected), output
     for reason in ("no chromium here", "no tshark here", "could not import 'no_such_package'", "for its own reason"):
-        assert f"not among ALLOWED_SKIPS of tests/conftest.py: {reason}" in output
+        assert (f"not among ALLOWED_SKIPS of tests/conftest.py: {reason}" in output) == bool(strict)
 
 
 STANDSTILL = """

@@ -97,8 +97,9 @@ def test_what_is_full_while_nobody_acknowledges(
     later.close()
 
 
-def test_a_device_waits_for_its_bus_and_leaves_nothing_behind(make_adapter: MakeAdapter) -> None:
-    adapter = make_adapter(queue=10)
+@pytest.mark.parametrize("queue", [10, pytest.param(1000, marks=pytest.mark.slow(reason="a longer queue"))])
+def test_a_device_waits_for_its_bus_and_leaves_nothing_behind(make_adapter: MakeAdapter, queue: int) -> None:
+    adapter = make_adapter(queue=queue)
     told: list[str] = []
 
     def say(line: str) -> None:

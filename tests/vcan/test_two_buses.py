@@ -1,7 +1,8 @@
-"""An arm whose emulated drives are on two interfaces."""
+"""Nodes on two interfaces: real and emulated ones side by side, and an arm whose emulated drives are on both."""
 
 from __future__ import annotations
 
+import signal
 import subprocess
 from collections.abc import Iterator
 from typing import Any
@@ -14,6 +15,25 @@ from canprobe.fieldbus.bus.real.socketcan import SocketCanPort
 
 pytestmark = pytest.mark.vcan
 SECOND = "vcan7"
+SCENE = """\
+[scene]
+name = "split"
+[cycle]
+rate_hz = 100
+[arm]
+emulated = false
+missed_syncs = 40
+[limits]
+late_cycles_max_percent = 100
+[sensor]
+channel = "can1"
+rate_hz = 50
+mode = "image"
+[object]
+kind = "plane"
+[task]
+kind = "press"
+"""
 
 
 def delete(link: str) -> None:
@@ -30,6 +50,30 @@ def second_bus() -> Iterator[SocketCanPort]:
     yield port
     port.close()
     delete(SECOND)
+
+
+@pytest.mark.slow(reason="two interfaces; in lockstep: tests/cell/integration/test_two_buses.py")
+def test_an_arm_of_another_process_and_an_emulated_sensor_on_its_own_bus(bench: Any, second_bus: Any) -> None:
+    arm = bench.start("emulate", "free", "--channel", "vcan0").until_told("serving nodes")
+    scene = bench.folder / "split.toml"
+    scene.write_text(SCENE)
+    buses = ("--bus", "socketcan", "--channel", "can0=vcan0", "--channel", f"can1={SECOND}")
+    command = bench.start("up", scene, *buses)
+    bench.bus.until_enabled(6, by=command)
+    second = second_bus.drain()
+    images = {can_id for can_id, _, _ in second if 0x511 <= can_id <= 0x531}
+    assert images == set(range(0x511, 0x532)), "the header and the 32 PDOs of an image"
+    assert {0x080, 0x77F, 0x710} <= {can_id for can_id, _, _ in second}
+    assert not {can_id for can_id, _, _ in second if 0x181 <= can_id <= 0x206}, "the arm's PDOs are on the other bus"
+    command.send(signal.SIGINT)
+    lines = command.end(0)
+    assert not [line for line in lines if "bit rate" in line or "warning" in line], "a virtual bus has none"
+    bench.bus.hear()
+    last = {can_id: data for can_id, data, _ in second + second_bus.drain()}
+    bench.assert_left_safe(bench.bus.last, 1, 2, 3, 4, 5, 6)
+    assert last[0x710] == b"\x7f", "the sensor is pre-operational"
+    assert not {can_id for can_id in bench.bus.last if 0x511 <= can_id <= 0x531}, "and was never on the arm's bus"
+    assert arm.running
 
 
 SPREAD = """\

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,16 +14,17 @@ from canprobe.fieldbus.eds.packaged import eds_path, load_eds
 
 pytestmark = pytest.mark.vcan
 MESSY = Path(__file__).parents[1] / "fieldbus" / "eds" / "messy"
-PACKAGED, VENDORS = 5, 20
+PACKAGED, VENDORS, DATA = 5, 20, 30
 PERIOD_S = 0.05
+BLOCK = bytes(random.Random(402).randbytes(3001))
 
 
 @pytest.fixture(scope="module")
 def served(start_shared: Any) -> Any:
-    """Our own drive and a vendor's; the last test of the module ends them."""
-    files = ("puma260_joint", PACKAGED), (MESSY / "drive402.eds", VENDORS)
+    """Our own drive, a vendor's drive and a vendor's other device; the last test of the module ends them."""
+    files = ("puma260_joint", PACKAGED), (MESSY / "drive402.eds", VENDORS), (MESSY / "types.eds", DATA)
     pairs = [word for path, node_id in files for word in ("--eds", path, "--node-id", node_id)]
-    return start_shared("emulate", *pairs, "--channel", "vcan0").until_told("serving nodes 5, 20 on vcan0")
+    return start_shared("emulate", *pairs, "--channel", "vcan0").until_told("serving nodes 5, 20, 30 on vcan0")
 
 
 @pytest.fixture
@@ -89,6 +91,21 @@ def check_motion(frames: list[tuple[int, bytes, int]], node_id: int) -> None:
     assert len(set(seen)) > 8, "in steps, not in one jump"
 
 
+def test_sdo_block_and_segmented_transfers(served: Any, network: Any) -> None:
+    node: Any = network.add_node(DATA, canopen.ObjectDictionary())
+    node.sdo.RESPONSE_TIMEOUT = 2.0
+    with node.sdo.open(0x200D, 0, "wb", buffering=1024, size=len(BLOCK), block_transfer=True) as file:
+        file.write(BLOCK)
+    with node.sdo.open(0x200D, 0, "rb", buffering=1024, block_transfer=True) as file:
+        assert file.read() == BLOCK
+    assert node.sdo.upload(0x200D, 0) == BLOCK, "segmented"
+    node.sdo.download(0x200D, 0, BLOCK[:100])
+    assert node.sdo.upload(0x200D, 0) == BLOCK[:100]
+    with pytest.raises(canopen.SdoAbortedError) as caught:
+        node.sdo.upload(0x2004, 0)
+    assert caught.value.code == 0x06010001, "write-only in the vendor's file"
+
+
 def test_the_vendors_name_is_served_as_written(served: Any, network: Any) -> None:
     node: Any = network.add_node(VENDORS, canopen.ObjectDictionary())
     node.sdo.RESPONSE_TIMEOUT = 2.0
@@ -97,6 +114,6 @@ def test_the_vendors_name_is_served_as_written(served: Any, network: Any) -> Non
 
 def test_serving_ends_with_an_interrupt_and_has_told_the_warnings(served: Any) -> None:
     served.send(2)
-    warnings, line = served.end(0)
-    assert warnings.partition(": ")[2].partition(";")[0] == "7 warnings"
-    assert line == "serving nodes 5, 20 on vcan0; Ctrl-C stops them"
+    *warnings, line = served.end(0)
+    assert [row.partition(": ")[2].partition(";")[0] for row in warnings] == ["7 warnings", "4 warnings"]
+    assert line == "serving nodes 5, 20, 30 on vcan0; Ctrl-C stops them"

@@ -1,7 +1,8 @@
-"""candump, cansend and tshark as witnesses: what they see on the bus and read in it is what our logs say."""
+"""can-utils and tshark as witnesses: what they see on the bus, and what they read in it, is what our logs say."""
 
 from __future__ import annotations
 
+import re
 import shutil
 import signal
 import struct
@@ -13,10 +14,12 @@ from typing import Any, Self
 
 import pytest
 from patience import patience_s
+from slow_scene import write_slow_scene
 
 from canprobe.errors import UsageError
 from canprobe.fieldbus.bus.candump import read_candump
 from canprobe.fieldbus.bus.port import ERR_FLAG
+from canprobe.fieldbus.protocol.frame_bits import best_case_bits, worst_case_bits
 from canprobe.fieldbus.protocol.frames import EFF_FLAG, RTR_FLAG
 
 pytestmark = pytest.mark.vcan
@@ -94,6 +97,30 @@ class Candump(Tool):
         return [frame for frame in read_log(self._path) if frame[0] != MARKER]
 
 
+class Load(Tool):
+    """canbusload, one line a second; it counts when the constructor returns."""
+
+    def __init__(self, path: Path, *options: str) -> None:
+        super().__init__(path, tool("stdbuf"), "-oL", tool("canbusload"), *options, "vcan0@1000000")
+        self.wait_lines(1)
+
+    def wait_lines(self, count: int) -> None:
+        """Until it has counted for so many seconds more."""
+        wanted = len(self.rows) + count
+        while len(self.rows) < wanted:
+            time.sleep(0.1)
+
+    @property
+    def rows(self) -> list[tuple[int, ...]]:
+        """Frames, bits and data bits of each second."""
+        found = re.findall(r"vcan0@1000000 +(\d+) +(\d+) +(\d+)", self.out)
+        return [tuple(map(int, row)) for row in found]
+
+    @property
+    def total(self) -> tuple[int, ...]:
+        return tuple(map(sum, zip(*self.rows, strict=True)))
+
+
 def send(frame: str) -> None:
     """One frame as cansend writes it."""
     subprocess.run([tool("cansend"), "vcan0", frame], check=True)
@@ -152,7 +179,31 @@ def read_log(path: Path) -> Frames:
     return [(can_id, data) for _, _, can_id, data in read_candump(path)]
 
 
-# ---------------------------------------------------------------- a bring-up, read by tshark
+# ---------------------------------------------------------------- a bring-up, seen by candump and read by tshark
+
+
+@pytest.fixture(scope="module")
+def bring_up(start_shared: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Frames, Frames, Path]:
+    """Our log of a bring-up with drives and sensor, candump's of the same, and the path of ours."""
+    folder = tmp_path_factory.mktemp("witness")
+    with Candump(folder / "candump.log") as candump:
+        scene = write_slow_scene(folder / "press-slow.toml", "press")
+        command = start_shared("run", scene, *ON_VCAN0, "--duration", "0.2", "--out", folder / "results")
+        status = command.wait()
+        assert status == 0, command.err
+    ours = folder / "results" / "bus.log"
+    return read_log(ours), candump.frames, ours
+
+
+@pytest.mark.slow(reason="a bring-up for two tools; the default asks candump with less")
+def test_candump_saw_every_frame_that_we_logged(bring_up: tuple[Frames, Frames, Path]) -> None:
+    ours, theirs = by_id(bring_up[0]), by_id(bring_up[1])
+    assert len(bring_up[0]) > 1000
+    assert set(ours) == set(theirs)
+    for can_id, frames in ours.items():
+        assert theirs[can_id][: len(frames)] == frames, f"{can_id:03X}"
+        rest = theirs[can_id][len(frames) :]
+        assert all(can_id > 0x700 for _ in rest), f"{can_id:03X}: {len(rest)} frames that only candump saw"
 
 
 FIELDS = (
@@ -189,12 +240,9 @@ def rebuild(row: dict[str, str]) -> bytes:
     return data
 
 
-@pytest.mark.slow(reason="a bring-up for one tool")
-def test_tshark_reads_every_frame_of_a_bring_up_as_we_wrote_it(bench: Any) -> None:
-    command = bench.start("run", bench.scene("press"), *ON_VCAN0, "--duration", "0.2", "--out", "results")
-    assert command.wait() == 0, command.err
-    path = bench.folder / "results" / "bus.log"
-    ours = read_log(path)
+@pytest.mark.slow(reason="a bring-up for two tools; the default asks candump with less")
+def test_tshark_reads_every_frame_of_the_bring_up_as_we_wrote_it(bring_up: tuple[Frames, Frames, Path]) -> None:
+    ours, _, path = bring_up
     words = [tool("tshark"), "-r", str(path), "-d", "can.subdissector,canopen", "-T", "fields", "-E", "separator=/t"]
     done = subprocess.run(
         [*words, *(word for field in FIELDS for word in ("-e", field))], capture_output=True, text=True, check=True
@@ -233,3 +281,37 @@ def test_cansend_asks_and_candump_hears_the_answer(served: Any, bench: Any) -> N
         bench.bus.until(complete, served)
     assert candump.frames == heard
     assert 0x185 not in by_id(heard), "TPDO1 of the drive is synchronous, and nobody sends a SYNC"
+
+
+@pytest.mark.slow(reason="one more tool of can-utils")
+def test_canbusload_counts_the_frames_and_bits_that_we_count(served: Any, bench: Any) -> None:
+    """Bits for the worst stuffing, as canbusload counts unless it is told to leave stuffing out."""
+    with Load(bench.folder / "worst.txt") as worst, Load(bench.folder / "best.txt", "-i") as best:
+        subprocess.run([tool("cangen"), "vcan0", "-g", "5", "-n", "150", "-I", "7E5", "-L", "r", "-D", "r"], check=True)
+        sizes = [len(data) for can_id, data, _ in bench.bus.hear() if can_id == 0x7E5]
+        worst.wait_lines(2)
+        best.wait_lines(1)
+        assert bench.bus.hear() == [], "a silent bus"
+    assert len(sizes) == 150
+    assert worst.total == (150, sum(map(worst_case_bits, sizes)), 8 * sum(sizes))
+    assert best.total == (150, sum(map(best_case_bits, sizes)), 8 * sum(sizes))
+
+
+@pytest.mark.slow(reason="one more tool of can-utils")
+def test_nodes_survive_what_cangen_throws_at_them(served: Any, bench: Any) -> None:
+    """Random identifiers and lengths, NMT commands and broken SDO requests among them."""
+    words = [tool("cangen"), "vcan0", "-g", "1", "-n", "1500", "-I", "r", "-L", "r", "-D", "r", "-v"]
+    out = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    lines = [line.split()[1].partition("#") for line in out.splitlines()]
+    thrown = [(int(can_id, 16), bytes.fromhex(data.replace(".", ""))) for can_id, _, data in lines]
+    assert len(thrown) == 1500
+    heard = by_id([frame[:2] for frame in bench.bus.hear()])
+    for can_id, datas in by_id(thrown).items():
+        left = iter(heard[can_id])
+        assert all(data in left for data in datas), f"{can_id:03X}: in this order in what we heard"
+    for node_id in NODES:
+        send(f"000#81{node_id:02X}")
+        bench.bus.until(lambda frame, n=node_id: frame[:2] == (0x700 + n, b"\0"), served)
+        send(f"{0x600 + node_id:03X}#4018100100000000")
+        answer = 0x580 + node_id, bytes.fromhex("431810015eca0000")
+        bench.bus.until(lambda frame, a=answer: frame[:2] == a, served)
