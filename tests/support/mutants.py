@@ -76,6 +76,8 @@ COMPARISONS = {
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
 }  # fmt: skip
 SUMS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.BitAnd: ast.BitOr}
+MOST_TESTS = 40
+"""Most tests that are recorded for a line, the quickest of all."""
 LEAST_TIMEOUT_S = 30
 """Shortest time, s, after which a test that does not end has failed."""
 
@@ -201,12 +203,12 @@ class Tree:
         self.run(["--cov", "--cov-context=test", "--cov-report=", *tests], 180, 7200, Seconds())
         data = CoverageData(str(self.folder / ".coverage"))
         data.read()
-        reached = {
-            f"{Path(path).relative_to(self.folder)}:{line}": [one.rpartition("|")[0] for one in contexts if one]
-            for path in data.measured_files()
-            for line, contexts in data.contexts_by_lineno(path).items()
-        }
         seconds = json.loads((self.folder / "seconds.json").read_text(encoding="utf-8"))
+        reached = {}
+        for path in data.measured_files():
+            for line, contexts in data.contexts_by_lineno(path).items():
+                found = sorted((one.rpartition("|")[0] for one in contexts if one), key=seconds.__getitem__)
+                reached[f"{Path(path).relative_to(self.folder)}:{line}"] = found[:MOST_TESTS]
         return {"seconds": seconds, "tests": reached}
 
     def kills(self, number: int, mutant: Mutant, tests: dict[str, float]) -> str | None:
