@@ -9,7 +9,7 @@ from canprobe.errors import NodeError
 from canprobe.fieldbus.protocol.pdo import PdoLayout
 
 MAX_SPEED_SHARE = 1.5
-"""Share of the stated speed above which a motion is not believed; SYNCs may be late by a period."""
+"""Share of the stated speed above which a motion is not believed, from the last SYNC to the answer to this one."""
 TOLERANCE_COUNTS = 2
 """Counts by which two readings may differ at rest."""
 
@@ -35,7 +35,7 @@ class CarrierReceiver:
         self._silent_ns = silent_cycles * period_ns
         self._place = [(entry.index, entry.subindex) for entry in layout.signals].index(ENCODER_POSITION)
         self._range, self._period_ns = counts_range, period_ns
-        self._sync_ns = self._t_ns = self._total = 0
+        self._sync_ns = self._heard_sync_ns = self._t_ns = self._total = 0
         self._counts: int | None = None
         self._heard_ns: int | None = None  # the first SYNC until it is heard
         self._jump: str | None = None
@@ -54,13 +54,13 @@ class CarrierReceiver:
         """Take the values of the TPDO; a position that the carrier cannot have reached is not believed."""
         counts, half, carrier = values[self._place], self._range // 2, self._carrier
         step = (counts - (carrier.zero if self._counts is None else self._counts) + half) % self._range - half
-        passed_s = 1e-9 * (self._t_ns - (self._heard_ns or 0) + self._period_ns)
+        passed_s = 1e-9 * (t_ns - self._heard_sync_ns + self._period_ns)  # a held-up machine sends its SYNC late
         most = MAX_SPEED_SHARE * carrier.units * carrier.speed * passed_s + TOLERANCE_COUNTS
         if self._counts is not None and abs(step) > most:
             self._jump = carrier.text(step / carrier.units)
             return
         self._total += step
-        self._counts, self._heard_ns = counts, self._t_ns
+        self._counts, self._heard_ns, self._heard_sync_ns = counts, self._t_ns, self._sync_ns
 
     @property
     def complete(self) -> bool:
