@@ -6,8 +6,9 @@ import json
 
 import pytest
 
-from canprobe.cell.session import served
+from canprobe.cell.session import bus_tools, served
 from canprobe.cli import main
+from canprobe.fieldbus import LockstepBus, VirtualClock
 from canprobe.fieldbus.motor.damiao import DamiaoMotor
 from canprobe.fieldbus.motor.protocol import SPECIAL, TYPES, MitCommand, RegisterOp, Rid, pack_register
 
@@ -65,3 +66,17 @@ def test_a_log_of_a_master_is_judged(first, status, tmp_path, capsys):
     assert ("with kp 50 at 0.300 rad: 15.0 N·m" in capsys.readouterr().out) == bool(status)
     assert main([*judge[:-3], "0x12", *judge[-2:]]) == 2
     assert "no answer of a motor with this --id and --mst-id" in capsys.readouterr().err
+
+
+def test_the_command_prints_a_row_a_motor(monkeypatch, capsys):
+    bus = LockstepBus(VirtualClock())
+    for motor in (DamiaoMotor("dm4310", 1), DamiaoMotor("dm4310", 1), DamiaoMotor("dm4340", 2, 0x12)):
+        bus.attach(motor)
+    found = bus_tools.scan(bus.port(), motors=True)
+    monkeypatch.setattr(bus_tools, "scan", lambda *_, motors, **__: found if motors else [])
+    assert main(["scan", "--motors", "--channel", "can0"]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert out[1].split() == ["1", "000h", "12.5", "30", "10", "dm4310", "off", "MIT"]
+    assert out[2].split() == ["2", "012h", "12.5", "10", "28", "dm4340", "or", "dm4340_48v", "off", "MIT"]
+    assert out[3] == "motor 1: 2 answer with this id; leave one on the bus, and change it"
+    assert main(["scan", "--motors", "--lss", "--channel", "can0"]) == 2

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from canprobe.cell.session import bus_tools
-from canprobe.cli import main
 from canprobe.errors import UsageError
 from canprobe.fieldbus import LockstepBus, VirtualClock
 from canprobe.fieldbus.bus.virtual.lockstep import Participant
 from canprobe.fieldbus.motor.damiao import DamiaoMotor
 from canprobe.fieldbus.motor.protocol import REGISTER_ID, RegisterOp, Rid
+from canprobe.fieldbus.motor.search import find_motors
 
 
 class Sender(Participant):
@@ -44,14 +43,14 @@ def test_motors_are_found_with_what_their_registers_say():
     port = bus_with(other, large)
     large.registers[Rid.TIMEOUT] = 300
     other.registers[Rid.VMAX] = 8.5
-    one, seven = bus_tools.scan(port, motors=True)
+    one, seven = find_motors(port)
     assert (one["motor_id"], one["mst_id"], one["types"]) == (1, 0x11, ["dm8009"])
     assert (one["ranges"], one["timeout_ms"], one["mode"], one["devices"]) == ([12.5, 45.0, 54.0], 15.0, "MIT", 1)
     assert (seven["motor_id"], seven["mst_id"], seven["types"], seven["timeout_ms"]) == (7, 0, [], 0.0)
 
 
 def test_two_motors_of_one_id_are_counted():
-    (found,) = bus_tools.scan(bus_with(DamiaoMotor("dm4310", 3), DamiaoMotor("dm4310", 3)), motors=True)
+    (found,) = find_motors(bus_with(DamiaoMotor("dm4310", 3), DamiaoMotor("dm4310", 3)))
     assert found["devices"] == 2
 
 
@@ -59,7 +58,7 @@ def test_nothing_is_sent_but_reading():
     """Frames on 7FFh set ids, write, store, and start the bootloader: none of those, on no other identifier."""
     ear, motor = Sender(), DamiaoMotor("dm4310", 1, 0x11)
     before = dict(motor.registers)
-    bus_tools.scan(bus_with(ear, motor), motors=True)
+    find_motors(bus_with(ear, motor))
     sent = [frame for frame in ear.heard if frame[0] != 0x11]
     assert len(sent) == 127 + 5
     assert all(can_id == REGISTER_ID and len(data) == 8 and data[2] == RegisterOp.READ for can_id, data in sent)
@@ -83,24 +82,12 @@ def test_where_canopen_is_heard_nothing_is_sent(frame, refused):
     port = bus_with(sender)
     if refused:
         with pytest.raises(UsageError, match=f"{frame[0]:03X}h is heard on .*; give motors a bus of their own"):
-            bus_tools.scan(port, motors=True)
+            find_motors(port)
         assert sender.heard == []
     else:
-        assert bus_tools.scan(port, motors=True) == []
+        assert find_motors(port) == []
 
 
 def test_any_answers_are_read_without_an_error():
     odd = [(0x11, b"\x01\x00\x33"), (0x11, b"\x01\x00\x33\xff" + bytes(4)), (0x11, b""), (0x12, b"\x02\x00\x33\x07")]
-    assert bus_tools.scan(bus_with(Sender(*odd)), motors=True) == []
-
-
-def test_the_command_prints_a_row_a_motor(monkeypatch, capsys):
-    port = bus_with(DamiaoMotor("dm4310", 1), DamiaoMotor("dm4310", 1), DamiaoMotor("dm4340", 2, 0x12))
-    found = bus_tools.scan(port, motors=True)
-    monkeypatch.setattr(bus_tools, "scan", lambda *_, motors, **__: found if motors else [])
-    assert main(["scan", "--motors", "--channel", "can0"]) == 0
-    out = capsys.readouterr().out.splitlines()
-    assert out[1].split() == ["1", "000h", "12.5", "30", "10", "dm4310", "off", "MIT"]
-    assert out[2].split() == ["2", "012h", "12.5", "10", "28", "dm4340", "or", "dm4340_48v", "off", "MIT"]
-    assert out[3] == "motor 1: 2 answer with this id; leave one on the bus, and change it"
-    assert main(["scan", "--motors", "--lss", "--channel", "can0"]) == 2
+    assert find_motors(bus_with(Sender(*odd))) == []
