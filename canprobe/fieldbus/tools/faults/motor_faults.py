@@ -68,10 +68,10 @@ class WatchdogTrip(Effect):
     needs = "motor"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.node.advance(t_ns)
+        out = self.node.advance(t_ns)
         if (motor := cast(DamiaoMotor, self.node)).status is MotorStatus.ENABLED:
             motor.turn(MotorStatus.COMMUNICATION_LOST)
-        return ()
+        return out
 
 
 class WrongRange(Effect):
@@ -81,12 +81,12 @@ class WrongRange(Effect):
     needs = "motor"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.node.advance(t_ns)
+        out = self.node.advance(t_ns)
         self._registers = cast(DamiaoMotor, self.node).registers
         self._found = {int(rid): self._registers[rid] for rid in (Rid.PMAX, Rid.VMAX, Rid.TMAX)}
         self._wrong = {rid: value * self.fault.value("ratio") for rid, value in self._found.items()}
         self._registers |= self._wrong
-        return ()
+        return out
 
     def end(self, t_ns: int) -> None:
         if self._wrong.items() <= self._registers.items():
@@ -100,9 +100,9 @@ class EncoderWrap(Effect):
     needs = "motor"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self.node.advance(t_ns)
+        out = self.node.advance(t_ns)
         cast(DamiaoMotor, self.node).joint.q += math.tau * self.fault.value("turns")
-        return ()
+        return out
 
 
 MOTOR_FAULTS: Mapping[str, FaultKind] = {name: BUS_FAULTS[name] for name in _LINK} | {**kinds_of(sys.modules[__name__])}
