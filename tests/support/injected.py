@@ -15,6 +15,7 @@ from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
 from canprobe.cell.tasks.task import Phase
 from canprobe.errors import CanprobeError
+from canprobe.fieldbus.bus.port import ControllerState
 from canprobe.fieldbus.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.fieldbus.tools.faults import Fault
 from canprobe.fieldbus.tools.faults.fault import Effect
@@ -46,6 +47,7 @@ class Injected:
         self.task = make_task(self.session.plan)
         self.at, self.action, self.until, self.own = at, action, at + until, own
         self.injected_ns = self.answered_ns = self.error = None
+        self.held = 0
         self._run()
 
     def _say(self, text):
@@ -90,6 +92,8 @@ class Injected:
         return controller
 
     def _progress(self, measurement):
+        supervisor = self.session.cell.supervisor
+        self.held += supervisor.seen.controller_state is ControllerState.PASSIVE
         self.after(measurement)
 
     def after(self, measurement):

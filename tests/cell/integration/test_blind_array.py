@@ -50,6 +50,7 @@ def run(scene, text, phase, after_s, **changes):
         ("press", "node 16: stuck-image", Phase.SCAN, 0.3, "the array has sent the same image for"),
         ("press", "node 16: replayed-image", Phase.SCAN, 0.3, "depth in the surface that it touched before means 3."),
         ("press", "node 16: gain-lost", Phase.SCAN, 0.3, "the measured force fell from"),
+        ("press", "node 16: replayed-image", Phase.SETTLE, 0.05, "depth in the surface that it touched before means"),
         ("press", "node 16: dead-rows first=0 rows=16", Phase.APPROACH, 0.05, "torques of the drives show a push of"),
         (
             "calibrate",

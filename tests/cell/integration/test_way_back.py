@@ -51,6 +51,19 @@ def test_a_joint_that_stands_in_the_approach_stops_the_cell_before_the_object():
     assert run.session.buses.truth["force_n"].max() == 0.0 and steps_deg(run, 3) < 0.1
 
 
+def test_while_a_drive_is_not_heard_the_others_stand_where_they_were_and_go_on_smoothly():
+    run = Injected("free", 200, lambda run: run.inject("node 3: mute for 11 ms"), until=300)
+    assert run.error is None
+    targets = run.session.cell.log.arrays()["q_target_rad"]
+    first, held = run.at + np.flatnonzero(np.isnan(targets[run.at : run.at + 20]).all(axis=1))[0], [0, 1, 3, 4, 5]
+    q = run.session.cell.log.arrays()["q_rad"]
+    assert np.abs(targets[first + 1, held] - q[first + 1, held]).max() < 5e-4, (
+        "next to where they are, not at the last target"
+    )
+    usual = np.nanmax(np.abs(np.diff(targets[: run.at], axis=0)))
+    assert np.nanmax(np.abs(np.diff(targets[first + 2 :], axis=0))) < 3.0 * usual
+
+
 @pytest.mark.parametrize(("phase", "t_s"), [(Phase.APPROACH, 0.05), (Phase.SETTLE, 0.1)])
 def test_a_retreat_before_the_scan_goes_back_on_the_measured_way(phase, t_s):
     class Retreating(Injected):
