@@ -37,20 +37,17 @@ BEYOND = {"stuck-image", "replayed-image", "gain-lost", "brake-stuck"}
 """Kinds whose force nothing but the array notices, and the array is wrong."""
 
 
-def thrown(kind, node, phase, for_s, **options):
-    """A press with one fault from the beginning of a phase on."""
-    start_ns = phase_windows("press", "ideal")[phase][0]
-    fault = Fault(CELL_FAULTS[kind], node, start_ns, round(for_s * S), seed=3, **options)
-    return FaultRun(task_plan("press", "ideal").with_seed(2), (fault,))
+def thrown(kind, node, phase, *, for_s=0.25, task="press", number=1, **values):
+    """A run of a task with one fault from the beginning of a phase on."""
+    fault = Fault(CELL_FAULTS[kind], node, phase_windows(task, "ideal")[phase][0], round(for_s * S), values, seed=7)
+    return FaultRun(task_plan(task, "ideal").with_seed(number), (fault,))
 
 
 def test_a_number_is_the_same_run_again():
-    """A node whose frames are lost while the probe presses: it is answered."""
     wanted = ("press", "contact", "ideal", "drop")
     cases = map(FaultCase.of, range(CASES))
     case = next(case for case in cases if (case.task, case.phase, case.plant, case.kind.name) == wanted)
-    run = run_case(case)
-    assert run == run_case(case) and run["failures"] == [] and run["hits"] > 0
+    assert run_case(case) == run_case(case)
 
 
 def test_every_kind_of_the_registry_is_drawn_in_every_task_phase_and_plant_at_a_node_that_can_have_it():
@@ -68,8 +65,9 @@ def test_every_kind_of_the_registry_is_drawn_in_every_task_phase_and_plant_at_a_
     assert {fault.duration_ns < 2 * S for _, fault in faults} == {True, False}
 
 
-def test_the_phases_of_a_task_follow_each_other():
-    windows = phase_windows("press", "ideal")
+@pytest.mark.parametrize("task", ["press", pytest.param("calibrate", marks=pytest.mark.slow(reason="a second task"))])
+def test_the_phases_of_a_task_follow_each_other(task):
+    windows = phase_windows(task, "ideal")
     assert tuple(windows) == PHASES
     edges = [edge for window in windows.values() for edge in window]
     assert edges == sorted(edges)
@@ -99,15 +97,19 @@ def test_one_run_is_told_by_its_number(capsys):
     assert main(["study", "estimators", "--seed", "3"]) == 2
 
 
+def deaf_to_findings(monkeypatch):
+    monkeypatch.setattr(Supervisor, "finding", lambda self, **_: None)
+    monkeypatch.setattr(touch, "touch_finding", lambda _: None)
+
+
 def test_the_score_sees_a_force_above_the_limit_and_when_a_fault_is_noticed(monkeypatch):
     """A sensor that falls mute while the probe comes near, and nobody who cares: the probe is driven on."""
-    supervised = thrown("mute", 16, "approach", 5.0).result()
+    supervised = thrown("mute", 16, "approach", for_s=5.0).result()
     assert supervised["failures"] == [] and supervised["named"]
     assert supervised["outcome"] in ("stopped for safety", "bus or node failure")
     assert 0.0 < supervised["noticed_ms"] < 50.0 and supervised["left_n"] == 0.0
-    monkeypatch.setattr(Supervisor, "finding", lambda self, **_: None)
-    monkeypatch.setattr(touch, "touch_finding", lambda _: None)
-    run = thrown("mute", 16, "approach", 5.0).result()
+    deaf_to_findings(monkeypatch)
+    run = thrown("mute", 16, "approach", for_s=5.0).result()
     assert any(failure.startswith("true force of ") for failure in run["failures"])
     assert run["force_share"] == run["force_max_n"] / 5.0 > 1.5 and run["above_ms"] > 100.0
 
@@ -152,9 +154,31 @@ def test_the_score_sees_a_hang_a_crash_a_torn_log_and_no_summary(monkeypatch, tm
     assert any(failure.startswith("summary: ValueError") for failure in failures)
 
 
+MORE = pytest.mark.slow(reason="more kinds of a study")
+
+
+@pytest.mark.parametrize(
+    ("kind", "node"),
+    [
+        ("drop", 3),
+        ("freeze", 3),
+        ("sto", 2),
+        *(
+            pytest.param(*more, marks=MORE)
+            for more in (("delay", 2), ("corrupt", 16), ("reboot", 5), ("wrong-data", 3))
+        ),
+    ],
+)
+def test_a_node_that_has_a_fault_in_contact_is_answered(kind, node):
+    run = thrown(kind, node, "contact").result()
+    assert run["failures"] == [] and run["hits"] > 0
+
+
 def test_a_corrupted_target_is_not_followed():
     """Bit errors behind the CRC of a drive's controller: it refuses the target, and the cell stops."""
-    run = thrown("corrupt", 2, "contact", 0.5, incoming=True).result()
+    start_ns = phase_windows("press", "ideal")["contact"][0]
+    corrupt = Fault(CELL_FAULTS["corrupt"], 2, start_ns, S // 2, incoming=True, seed=3)
+    run = FaultRun(task_plan("press", "ideal").with_seed(2), (corrupt,)).result()
     assert run["outcome"] != "completed" and run["failures"] == [] and run["force_max_n"] < 5.0
 
 
@@ -245,13 +269,17 @@ def test_failures_are_told():
     assert findings_on_vcan(rows)[0] == "2 runs on vcan0, 1 failed." and "node 3 moves" in findings_on_vcan(rows)[1]
 
 
-def test_without_ip_or_the_right_to_use_it_the_study_on_vcan_says_so_at_once(monkeypatch, capsys, tmp_path):
+def test_without_ip_the_study_on_vcan_names_the_package(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("canprobe.lab.studies.faults_vcan.check_interface", lambda _: None)
-    with monkeypatch.context() as without_ip:
-        without_ip.setattr("shutil.which", lambda _: None)
-        assert main(["study", "faults", "--vcan"]) == 3
+    monkeypatch.setattr("shutil.which", lambda _: None)
+    assert main(["study", "faults", "--vcan"]) == 3
     assert "apt-get install -y iproute2" in capsys.readouterr().err
+
+
+def test_without_the_right_to_set_the_interface_the_study_says_so_before_anything_runs(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("canprobe.lab.studies.faults_vcan.check_interface", lambda _: None)
     (tmp_path / "ip").write_text("#!/bin/sh\necho 'RTNETLINK answers: Operation not permitted' >&2\nexit 2\n")
     (tmp_path / "ip").chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
