@@ -74,10 +74,10 @@ def test_faults_are_thrown_from_the_start_and_while_the_nodes_are_served(served,
         first, second = participants[:2]
         for node in (first, second):
             node.start(0)
-        t_ns = MonotonicClock().now_ns()
+        clock = MonotonicClock()
 
         def heard(node):
-            return len(node.receive(0x600 + node.node_id, READ_1000, t_ns + 1_000_000_000))
+            return len(node.receive(0x600 + node.node_id, READ_1000, clock.now_ns()))
 
         answers.append((heard(first), heard(second)))
         answers.append(inject("node 1: mute"))
