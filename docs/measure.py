@@ -80,7 +80,7 @@ Columns = Mapping[str, str]
 
 TABLES: Mapping[str, tuple[Callable[[Sequence[Row]], Sequence[Row]], Columns]] = {
     "regions": (
-        lambda rows: [row for row in rows if row["group"] in ("kind", "behind a jump", "array")],
+        lambda rows: [row for row in rows if row["group"] in ("kind", "behind a jump", "array", "speed", "force")],
         {
             "scenes by": "{group}",
             "of": "{of}",
@@ -92,6 +92,8 @@ TABLES: Mapping[str, tuple[Callable[[Sequence[Row]], Sequence[Row]], Columns]] =
             "stated over error": "{stated_over_error:.2f} ({stated_low:.2f} to {stated_high:.2f})",
             "error, 1/m": "{error_per_m:.2f}",
             "log score": "{log_score:.2f}",
+            "forces within 2σ": "{force:.1%}",
+            "heights within 2σ, and relative": "{bands:.1%}, {relative_bands:.1%}",
             "worst scene": "{worst}",
         },
     ),

@@ -222,7 +222,7 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
     if setup.array is not None:
         yield from _calibration_warnings(setup.array)
     if setup.touch is not None:
-        yield from _beyond_the_calibration(setup.touch)
+        yield from _beyond_what_is_known(setup.touch)
     if (cut := cut_patch(setup)) is not None:
         yield cut[0]
     if setup.arm is not None and setup.touch is not None:
@@ -237,15 +237,21 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
         )
 
 
-def _beyond_the_calibration(task: Touch | Calibrate) -> Iterator[str]:
-    """Warning of a force that the calibration has not seen."""
+def _beyond_what_is_known(task: Touch | Calibrate) -> Iterator[str]:
+    """Warnings of a force that the calibration has not seen, and of a speed beyond those that settings rest on."""
     from canprobe.mechanics.touch.image.force_errors import BEYOND_SIGMA
+    from canprobe.mechanics.touch.online.regions import FASTEST_M_S, beyond_factor
 
     errors = task.array.calibration.force
     if more := errors.beyond(task.force):
         yield (
             f"task.force_n = {task.force:g}: the calibration of the array has forces up to {errors.highest:g} N; beyond"
             f" them the force errs by {100 * BEYOND_SIGMA * more:.1f} % more (1σ), and regions are wider"
+        )
+    if isinstance(task, Touch) and task.shape and task.scan and (wider := beyond_factor(0.0, task.scan.speed)) > 1.0:
+        yield (
+            f"task.speed_mm_s = {1e3 * task.scan.speed:g}: what curvature is known to was found up to"
+            f" {1e3 * FASTEST_M_S:g} mm/s; regions are {wider:.2f} times as wide"
         )
 
 

@@ -65,7 +65,7 @@ def force_sigma_of(array: Array, probe: Probe, force: float, seconds: float) -> 
         array: the array, with its calibration.
         probe: the probe that carries it.
         force: force, N.
-        seconds: time since the touch, s.
+        seconds: time since the touch and the tare before it, s.
     """
     errors, calibration = array.calibration.force, array.calibration
     # pressure k δ on a plane; a flat array has no such layer, and its light touches are not known
@@ -77,6 +77,7 @@ def force_sigma_of(array: Array, probe: Probe, force: float, seconds: float) -> 
         late_decades_after(seconds),
         reference=0.0 if calibration.nominal else calibration.force_sigma,
         peak=peak_pa / array.pad.full_scale_pa,
+        age_s=seconds,
     )
 
 

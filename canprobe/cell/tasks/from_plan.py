@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 from canprobe.cell.master.controller import Controller
 from canprobe.cell.planning.model import Plan
 from canprobe.cell.scene.plugins import find_plugin
-from canprobe.cell.scene.setup import Array, Calibrate, Free, Probe, Setup, Touch
+from canprobe.cell.scene.setup import Array, Calibrate, Free, Probe, Scan, Setup, Touch
 from canprobe.cell.tasks.shape import OfferedEstimator, RenewedEstimator, ShapeRecord, ShapeTracker, replay_samples
 from canprobe.fieldbus.protocol.tactile import DEFAULT_WINDOW
 
 if TYPE_CHECKING:
     from canprobe.cell.tasks.sensing import ContactSensing
-    from canprobe.mechanics.touch import ContactSample, Correlation, Estimator, ImageModel, SurfaceMap
+    from canprobe.mechanics.touch import ArrayCalibration, ContactSample, Correlation, Estimator, ImageModel, SurfaceMap
     from canprobe.mechanics.touch.online.estimator import AnswerStage
 
 
@@ -80,18 +80,21 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
     motion = make_estimator(method, **settings)
     if method not in REFINED_METHODS:
         return motion
-    return OnlineEstimator(motion, *_stages(task, memory, task.scan.rolling_share))
+    return OnlineEstimator(motion, *_stages(task, memory, task.scan))
 
 
-def _stages(task: Touch, memory: float, rolling_share: float) -> Iterator[AnswerStage]:
+def _stages(task: Touch, memory: float, scan: Scan) -> Iterator[AnswerStage]:
     """The stages of a task's answers, in order."""
     from canprobe.mechanics.touch import MapFusion, NoiseLevel, PatchCurvature, PatchFusion, SystematicErrors
+    from canprobe.mechanics.touch.online.regions import beyond_factor
 
     assert task.shape is not None
     if _uses_patch(task):
-        yield PatchFusion(PatchCurvature(_image_model(task), SIGMA_STIFFNESS), memory)
+        others = [_image_model(task, other) for other in task.array.calibration.others_of_make()]
+        yield PatchFusion(PatchCurvature(_image_model(task), SIGMA_STIFFNESS, others), memory)
     yield NoiseLevel(memory)
-    yield SystematicErrors.of_scan(memory, rolling_share, task.probe.position_sd)
+    wider = beyond_factor(task.array.calibration.force.beyond(task.force), scan.speed)
+    yield SystematicErrors.of_scan(memory, scan.rolling_share, task.probe.position_sd, wider)
     if task.shape.revisit:
         yield MapFusion(make_surface_map(task), memory)
 
@@ -105,13 +108,15 @@ def _typical_sigma(task: Touch) -> float:
     return task.array.calibration.noise.lateral(task.array.pad.lightness(probe.stiffness * float(depth)))
 
 
-def _image_model(task: Touch) -> ImageModel:
+def _image_model(task: Touch, calibration: ArrayCalibration | None = None) -> ImageModel:
+    """The image model of a task's array, by its calibration or another one."""
     from canprobe.mechanics.touch import make_image_model, make_patch_calibration
 
     array = task.array
     patch = make_patch_calibration(array.calibration, array.pad)
     windowed = array.mode == "window" and int(array.window) <= DEFAULT_WINDOW
-    return make_image_model(array.calibration, patch, seen=int(array.window) if windowed else None)
+    seen = int(array.window) if windowed else None
+    return make_image_model(calibration or array.calibration, patch, seen=seen)
 
 
 def make_surface_map(task: Touch) -> SurfaceMap:
@@ -134,8 +139,7 @@ def make_shape_tracker(setup: Setup, *, with_map: bool = True) -> ShapeTracker |
         return None
     samples = max(1, round(task.shape.every_s * task.array.rate_hz))
     surface_map = make_surface_map(task) if with_map and setup.outputs.surface_map else None
-    beyond = task.array.calibration.force.beyond(task.force)
-    return ShapeTracker(make_shape_estimator(task, task.shape.method), samples, surface_map, beyond)
+    return ShapeTracker(make_shape_estimator(task, task.shape.method), samples, surface_map)
 
 
 def estimates_of(

@@ -16,6 +16,7 @@ import numpy as np
 from canprobe.cell.scene.plugins import Plugin
 from canprobe.errors import CanprobeError, UsageError
 from canprobe.mechanics.touch.estimate.estimator import Estimator, Steps, at_once
+from canprobe.mechanics.touch.estimate.path_length import PathLength
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch import ContactSample, SurfaceEstimate, SurfaceMap
@@ -26,6 +27,8 @@ GAP_S = 0.1
 SAMPLES_KEPT, RECORDS_KEPT = 40_000, 10_000
 """Contacts that a tracker keeps, the last ones, and answers, evenly over the scan: 200 s and 400 s of a scan with an
 array of 200 Hz and an answer every 40 ms. A longer scan takes no more memory, and no more time at its end."""
+PATH_STEP_M = 0.2e-3
+"""Least step of the path of a contact: the noise of slow and light scans would add up to three times their path."""
 MAPPED_AT_ONCE = 16
 """Contacts that the map takes at once, in a step of its own: 0.3 ms, half of what they cost one by one."""
 MAX_CURVATURE = 1e3
@@ -65,7 +68,6 @@ class ShapeTracker:
         estimator: the online estimator.
         every: samples between two answers.
         surface_map: map that takes the contacts, too; None: none.
-        beyond: how far the force is above all that the calibration of the array has seen (`ForceErrors.beyond`).
 
     Attributes:
         records: the answers; of more than `RECORDS_KEPT` every second, every fourth and so on.
@@ -76,17 +78,16 @@ class ShapeTracker:
         doubted: whether images mean another curvature than the calibration says, so that regions are wider.
     """
 
-    def __init__(
-        self, estimator: Estimator, every: int, surface_map: SurfaceMap | None = None, beyond: float = 0.0
-    ) -> None:
+    def __init__(self, estimator: Estimator, every: int, surface_map: SurfaceMap | None = None) -> None:
         self.records: list[ShapeRecord] = []
         self.samples: deque[ContactSample] = deque(maxlen=SAMPLES_KEPT)
         self.travelled_m = 0.0
         self.restarts = self.withheld = 0
         self.doubted = False
         self._estimator = estimator
+        self._path_length = PathLength(PATH_STEP_M)
         self._every = max(1, every)
-        self._map, self._beyond = surface_map, beyond
+        self._map = surface_map
         self._waiting: deque[tuple[ContactSample, float]] = deque()  # with the path up to each
         self._unmapped: list[ContactSample] = []
         self._added = self._taken = self._answers = 0
@@ -97,14 +98,12 @@ class ShapeTracker:
 
     def add(self, sample: ContactSample) -> None:
         """Note one contact; `work` takes it."""
-        if self.samples:
-            last = self.samples[-1]
-            if sample.t_s - last.t_s > GAP_S:
-                self._estimator.reset()
-                self._waiting.clear()
-                self._taken, self._found, self._steps = self._added, None, self._work()
-            else:
-                self.travelled_m += math.dist(sample.p_base.tolist(), last.p_base.tolist())
+        if self.samples and sample.t_s - self.samples[-1].t_s > GAP_S:
+            self._estimator.reset()
+            self._waiting.clear()
+            self._path_length = PathLength(PATH_STEP_M)
+            self._taken, self._found, self._steps = self._added, None, self._work()
+        self.travelled_m += self._path_length.add(sample.p_base)
         self._added += 1
         self.samples.append(sample)
         self._waiting.append((sample, self.travelled_m))
@@ -224,11 +223,10 @@ class ShapeTracker:
         if has_diverged(estimate):
             self._start_afresh()
             return
-        if self.doubted or self._beyond:
+        if self.doubted:
             from canprobe.mechanics.touch.online import regions  # only where a shape is asked for
 
-            factor = regions.beyond_factor(self._beyond) * (regions.FOREIGN_ARRAY_FACTOR if self.doubted else 1.0)
-            estimate = regions.scaled(estimate, factor)
+            estimate = regions.scaled(estimate, regions.FOREIGN_ARRAY_FACTOR)
         self._found = estimate, at_s, travelled
 
     def _start_afresh(self) -> None:

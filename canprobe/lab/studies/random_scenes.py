@@ -4,7 +4,7 @@ The seed of a scene is `draw · 100 000 + kind · 1000 + number`, so that it nam
 three groups. A `shipped` array has the packaged calibration of its make, gains of its own, and in half of the scenes a
 layer up to 1.8 × softer or harder than stated. A `calibrated` array has blur, gains, hysteresis, creep, crosstalk, full
 scale and layer of its own, and the calibration that touches of this array gave. A `foreign` array is like it, but has
-the packaged calibration, which was made on another one.
+the packaged calibration and another serial number, so that its cell knows it for another one of the make.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from canprobe.cell.plant.taxels import TaxelArray, TaxelConfig
-from canprobe.cell.scene.calibrations import dump_calibration
+from canprobe.cell.scene.calibrations import dump_calibration, load_calibration
 from canprobe.cell.scene.load import load_scene
 from canprobe.cell.scene.model import ObjectSettings, PlantSettings, Scene
-from canprobe.cell.scene.resolve import LAYER_STIFFNESS
+from canprobe.cell.scene.resolve import EMULATED_ARRAY, LAYER_STIFFNESS
 from canprobe.errors import UsageError
 from canprobe.lab.studies.array_presses import RADIUS_M, Presses, calibrated, pad_of, random_array
 from canprobe.lab.studies.drawn_shapes import centred, heights_file, waves_mm
@@ -37,8 +37,10 @@ CELLS = {
 orientation of the probe, so that the contact runs over the pad."""
 FOREIGN = "foreign"
 """Kind of the scenes whose array has a foreign calibration; their objects are of all other kinds by turns."""
-PATH_MM, SHORTEST_S, LONGEST_S = 100.0, 4.0, 10.0
+PATH_MM, SHORTEST_S, LONGEST_S = 100.0, 4.0, 12.0
 """Way of a scan, and the least and most time for it."""
+SPEEDS_MM_S, FORCES_N = (3.0, 100.0), (0.2, 10.0)
+"""Least and greatest speed and force of a scan, with an equal share of each octave."""
 TOOL_ERROR_MM = 0.4
 """Largest error of the centre of the probe along an axis, in half of the scenes."""
 MOST_CURVED_PER_M = 15.0
@@ -130,11 +132,11 @@ def random_scene(seed: int, folder: Path) -> DrawnScene:
     strategy = str(rng.choice(["weave", "straight", "circle"], p=[0.5, 0.3, 0.2]))
     sides = 1.0 if strategy == "circle" else 2.0  # a circle begins at the touch, other paths lead to both sides of it
     longest = max(8.0, min(40.0, sides * keys.pop("sharpest_mm") * math.sin(math.radians(tilt_deg))))
-    speed = _spread(rng, 5.0, 40.0)
+    speed, force = _spread(rng, *SPEEDS_MM_S), _spread(rng, *FORCES_N)
     task = replace(
         base.task,
         strategy=strategy,  # type: ignore[arg-type]
-        force_n=_within(rng, 0.5, 3.0),
+        force_n=force,
         speed_mm_s=speed,
         heading_deg=_within(rng, 0.0, 360.0),
         length_mm=_within(rng, 0.6 * longest, longest),
@@ -152,11 +154,12 @@ def random_scene(seed: int, folder: Path) -> DrawnScene:
     if group != "shipped":
         config, stiffness, _ = own_array(seed)
         array, sensor = _emulated(seed), replace(sensor, full_scale_kpa=1e-3 * config.full_scale_pa)
-    if group == "calibrated":
+        own = group == "calibrated"
+        fit = calibrated(Presses(*own_array(seed)), f"emulated, seed {seed}") if own else None
+        calibration = load_calibration(EMULATED_ARRAY) if fit is None else fit.calibration
         file = folder / "calibration.toml"
-        fit = calibrated(Presses(*own_array(seed)), f"emulated, seed {seed}")
-        file.write_text(dump_calibration(fit.calibration), encoding="utf-8")
-        sensor = replace(sensor, calibration=str(file))
+        file.write_text(dump_calibration(replace(calibration, serial_number=1)), encoding="utf-8")
+        sensor = replace(sensor, calibration=str(file), serial_number=1 if own else 2)
     scene = replace(
         base,
         scene=replace(base.scene, name=f"random-{seed}", seed=seed),
@@ -164,6 +167,7 @@ def random_scene(seed: int, folder: Path) -> DrawnScene:
         bus=replace(base.bus, interface="direct"),
         object=ObjectSettings(position_mm=place, rotation_deg=(0.0, 0.0, _within(rng, 0.0, 180.0)), **keys),
         task=task,
+        limits=replace(base.limits, force_max_n=max(base.limits.force_max_n, 1.5 * force)),
         sensor=sensor,
         shape=replace(base.shape, also=()),
         plant=PlantSettings(stiffness_n_m3=stiffness, tool_error_mm=(x, y, z)),

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.results.scores import RUN_IN_M, curvature_tensor
+from canprobe.cell.results.scores import RUN_IN_M, curvature_tensor, score_measured_force, summarise_map
 from canprobe.cell.scene.model import highest
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.from_plan import make_task
@@ -48,6 +48,9 @@ class ScoredScan(NamedTuple):
             length of the error in the region's, and the logarithm of the density at the truth.
         behind_late, behind: the same of those behind a jump.
         noticed: whether the cell found the array not to be as its calibration says.
+        force: share of the seconds in which the force errs by 2σ or less.
+        bands, relative_bands: shares of the map's places whose height errs by 2σ or less, and by 2σ against the rest of
+            the surface. NaN where nothing was touched, as for the force.
     """
 
     seed: int
@@ -66,6 +69,9 @@ class ScoredScan(NamedTuple):
     behind_late: int
     behind: Floats
     noticed: bool = False
+    force: float = math.nan
+    bands: float = math.nan
+    relative_bands: float = math.nan
 
     @property
     def share(self) -> float:
@@ -113,7 +119,16 @@ def measure(seed: int) -> ScoredScan:
                 session.run(task)
         except SafetyStop as stop:
             ended = f"stopped: {stop.reason}"
-    return as_scan(drawn, ended, *scores_of(session, task.shape.records))._replace(noticed=bool(task.remarks))
+    scan = as_scan(drawn, ended, *scores_of(session, task.shape.records))._replace(noticed=bool(task.remarks))
+    if not task.shape.samples:
+        return scan
+    log, truth = session.cell.log.arrays(), session.buses.truth
+    first = int(np.searchsorted(log["t_s"], task.shape.samples[0].t_s))
+    score = score_measured_force(log, truth, first, len(log["t_s"]))
+    heights = summarise_map(task.shape.surface_map, session.plan.setup.truth.object)
+    held = heights["within_2_sigma_fraction"], heights["within_2_sigma_relative_fraction"]
+    bands, relative = (math.nan if share is None else share for share in held)
+    return scan._replace(force=score["force_within_2_sigma_fraction"], bands=bands, relative_bands=relative)
 
 
 def as_scan(drawn: DrawnScene, ended: str, late: list[list[float]], behind: list[list[float]]) -> ScoredScan:

@@ -21,6 +21,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -61,17 +62,25 @@ MODEL = (
     "fieldbus", "mechanics", "cell", "scenes", "cells", "arrays", "calibrations", "lab/studies/array_presses.py",
     "lab/studies/random_scenes.py", "lab/studies/region_scores.py",
 )  # fmt: skip
+BESIDE = ("force", "bands", "relative_bands")
+"""Shares of a scene beside its regions, whose mean over scenes a row has."""
 COMPARED = ("refused", "stopped", "observed", "coverage", "stated_over_error", "log_score")
 """Figures that are shown beside those of an earlier run."""
 BY: Mapping[str, Callable[[ScoredScan], str]] = {
     "array": lambda scan: scan.array,
     "cell": lambda scan: scan.cell,
     "path": lambda scan: scan.path,
-    "speed": lambda scan: "5–14 mm/s" if scan.speed_mm_s < 14.0 else "14–40 mm/s",
-    "force": lambda scan: "0.5–1.5 N" if scan.force_n < 1.5 else "1.5–3 N",
+    "speed": lambda scan: _between(scan.speed_mm_s, (3.0, 14.0, 40.0, 100.0), "mm/s"),
+    "force": lambda scan: _between(scan.force_n, (0.2, 0.5, 3.0, 10.0), "N"),
     "tool": lambda scan: "true tool" if scan.tool_error_mm == 0.0 else "wrong tool",
 }
 """Groups of the table besides the kinds of surfaces."""
+
+
+def _between(value: float, ends: Sequence[float], unit: str) -> str:
+    """The span of these that has a value."""
+    low, high = next(pair for pair in pairwise(ends) if value < pair[1] or pair[1] == ends[-1])
+    return f"{low:g}–{high:g} {unit}"
 
 
 def run(*, quick: bool, sweep: Sweep, draw: int = TEST_DRAW, against: Path | None = None) -> StudyResult:
@@ -159,8 +168,15 @@ def row_of(group: str, name: str, scans: Sequence[ScoredScan]) -> Row:
         "error_per_m": math.sqrt(float(np.mean(answers[:, 1]))),
         "stated_over_error": math.exp(float(np.mean(sums[:, 2]))) if shares else math.nan,
         "stated_low": stated[0], "stated_high": stated[1], "log_score": float(np.mean(answers[:, 4])),
+        **{name: mean_of([getattr(scan, name) for scan in answering]) for name in BESIDE},
         "worst": f"{worst.seed}: {worst.share:.2f}" if worst is not None else "",
     }  # fmt: skip
+
+
+def mean_of(shares: Sequence[float]) -> float:
+    """Mean of the shares that are known; NaN without any."""
+    known = [share for share in shares if not math.isnan(share)]
+    return sum(known) / len(known) if known else math.nan
 
 
 def findings(rows: Sequence[Row], scans: Sequence[ScoredScan]) -> list[str]:
@@ -173,6 +189,10 @@ def findings(rows: Sequence[Row], scans: Sequence[ScoredScan]) -> list[str]:
         f"({100 * whole['coverage_low']:.1f} to {100 * whole['coverage_high']:.1f} by scenes drawn anew), stated over "
         f"error {whole['stated_over_error']:.2f}, {100 * whole['observed']:.1f} % of the answers observe all of K."
     ]
+    said.append(
+        f"Within 2σ, means over scenes: forces of {100 * whole['force']:.1f} % of the seconds; of the map's heights"
+        f" {100 * whole['bands']:.1f} %, and {100 * whole['relative_bands']:.1f} % against the rest of the surface."
+    )
     low, high = COVERAGE_GOAL
     least, most = STATED_GOAL
     odd = {

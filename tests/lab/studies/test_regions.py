@@ -91,7 +91,7 @@ def test_findings_name_the_goals_that_are_missed_and_repeat_the_worst_scene():
     assert len(goals) == 4 and all("missed by" in line and "torus" in line for line in goals)
     assert any(line.startswith("Scored apart") for line in said)
     assert said[-1].endswith("canprobe study regions --seed 206003")
-    assert all("met" in line for line in findings(rows_of(sound), sound)[2:])
+    assert all("met" in line for line in findings(rows_of(sound), sound)[3:])
 
 
 def test_a_scene_without_answers_is_counted_and_another_one_is_drawn():

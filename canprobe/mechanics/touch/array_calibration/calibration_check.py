@@ -73,7 +73,7 @@ class CalibrationCheck:
     """
 
     def __init__(self, calibration: ArrayCalibration, pad: Pad) -> None:
-        image = calibration.image
+        image, self._of_make = calibration.image, calibration.of_make
         self._pad, self._stiffness, self._crosstalk = pad, image.stiffness, image.crosstalk
         self._blur = image.blur / pad.pitch_m
         self._gains = np.array(calibration.gains) if calibration.gains else np.ones(pad.shape)
@@ -206,8 +206,11 @@ class CalibrationCheck:
 
     @property
     def image_model_off(self) -> bool:
-        """Whether images mean another curvature than the calibration says: another stiffness alone does not."""
-        return bool(self.blur_off or self.disagreement or self.contradicted)
+        """Whether images mean another curvature than the calibration says: another stiffness alone does not.
+
+        Never of an array that is known to be another one of the make: its regions have these errors.
+        """
+        return not self._of_make and bool(self.blur_off or self.disagreement or self.contradicted)
 
     @property
     def contradicted(self) -> float:

@@ -16,6 +16,9 @@ from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD, UNSTATED, F
 
 ForceReference = Literal["scale", "weights", "unit", "none"]
 NO_FORCE_REFERENCE = "nominal newtons: no force reference"
+MAKE_BLUR, MAKE_CROSSTALK = 0.2, 0.014
+"""Standard deviations of blur, relative, and crosstalk between arrays of one make: those of the arrays that studies
+draw. Images of a small patch are mostly blur, and those of a large one are not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,6 +229,15 @@ class ArrayCalibration:
         """What it says about another array of its make: no gains of single taxels, and the spread of a make."""
         force = replace(self.force, spread=max(self.force.spread, MAKE_SPREAD))
         return replace(self, gains=(), dead=(), force=force, of_make=True)
+
+    def others_of_make(self) -> list[ArrayCalibration]:
+        """What arrays of the make may have instead, each with one parameter off by a standard deviation.
+
+        None where the array is the calibrated one.
+        """
+        p = self.image
+        off = replace(p, blur=p.blur * (1.0 + MAKE_BLUR)), replace(p, crosstalk=p.crosstalk + MAKE_CROSSTALK)
+        return [replace(self, image=image) for image in off if self.of_make]
 
     def with_stiffness(self, stiffness: float) -> ArrayCalibration:
         """The same calibration with another stiffness K/h of the layer, N/m³."""

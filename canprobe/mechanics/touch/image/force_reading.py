@@ -22,6 +22,7 @@ class ForceReading:
         self._errors, self._reference = calibration.force_errors, calibration.reference_sigma
         self._pad = calibration.pad
         self._creep = ForceCreep(self._errors.creep)
+        self._began_s: float | None = None
 
     def widen(self, spread: float) -> None:
         """State forces with this relative standard deviation between arrays from now on, where it is the larger one."""
@@ -35,6 +36,7 @@ class ForceReading:
             patch: patch of this image alone.
         """
         errors, creep = self._errors, self._creep
+        self._began_s = t_s if self._began_s is None else self._began_s
         shown = creep.step(t_s, patch.force, touching=patch.force >= TOUCH_FORCE / 2)
         # newtons rest on touches that had crept by so many decades: their creep is in the gains
         force = shown * (1.0 + errors.creep * errors.creep_decades)
@@ -46,7 +48,8 @@ class ForceReading:
             reference=self._reference,
             peak=patch.peak_pa / self._pad.full_scale_pa,
             bridged=patch.bridged,
-            cut=patch.cut_by_pad,
+            cut=1.0 if patch.cut_by_pad else patch.cut_by_window,
+            age_s=t_s - self._began_s,
         )
         if patch.saturated or patch.off_pad:
             sigma = ForceSigma(sigma.reference, sigma.array, sigma.creep, math.inf)

@@ -68,7 +68,7 @@ class Patch(NamedTuple):
         n_active: number of taxels at or above the threshold; −1 where only features were sent.
         peak_pa: highest taxel pressure, Pa.
         saturated: whether a taxel is at its largest count.
-        cut_by_window: whether the patch reaches an edge of the window inside the pad; force and centroid include an
+        cut_by_window: pressure at an edge of the window inside the pad, over the peak; force and centroid include an
             extrapolation beyond it (`Continuation`).
         cut_by_pad: whether the patch reaches the pad's edge.
         too_few: whether fewer than four taxels are active, too few for moments.
@@ -86,7 +86,7 @@ class Patch(NamedTuple):
     n_active: int
     peak_pa: float
     saturated: bool
-    cut_by_window: bool
+    cut_by_window: float
     cut_by_pad: bool
     too_few: bool
     dead: int = 0
@@ -260,7 +260,7 @@ def compute_patch(
         n_active=n_active,
         peak_pa=peak_pa,
         saturated=peak >= COUNTS_MAX,
-        cut_by_window=at_window > 0.0,
+        cut_by_window=at_window / peak_pa,
         cut_by_pad=at_pad > 0.0,
         too_few=n_active < _MIN_TAXELS,
         dead=dead,
@@ -269,7 +269,7 @@ def compute_patch(
 
 
 def _nothing(peak_pa: float) -> Patch:
-    return Patch(0.0, math.nan, math.nan, 0, peak_pa, False, False, False, True)
+    return Patch(0.0, math.nan, math.nan, 0, peak_pa, False, 0.0, False, True)
 
 
 def _force_and_centroid(total: float, u: float, v: float, calibration: PatchCalibration) -> tuple[float, float, float]:
@@ -332,7 +332,7 @@ def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -
         n_active=-1,
         peak_pa=peak_pa,
         saturated=peak >= COUNTS_MAX,
-        cut_by_window=False,
+        cut_by_window=0.0,
         cut_by_pad=cut_by_pad,
         too_few=False,
         off_pad=reached > 0.0 or at_edge,

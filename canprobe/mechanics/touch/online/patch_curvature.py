@@ -19,6 +19,7 @@ mean shows it: the difference of the two, extrapolated to now, counts as an erro
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -141,6 +142,7 @@ class PatchCurvature:
     Args:
         model: model of the sensor.
         sigma_stiffness: standard deviation of the logarithm of the model's stiffness, before any touch.
+        others: models of other arrays of the make, each one standard deviation off; none of a calibrated array.
 
     Attributes:
         stiffness: stiffness of the layer, the state of the scan; a loss of contact does not reset it.
@@ -149,8 +151,8 @@ class PatchCurvature:
         refused: number of contacts without moments (saturated, at the pad's edge, hardly any taxel, or none sent).
     """
 
-    def __init__(self, model: ImageModel, sigma_stiffness: float = 1e-3) -> None:
-        self.model = model
+    def __init__(self, model: ImageModel, sigma_stiffness: float = 1e-3, others: Sequence[ImageModel] = ()) -> None:
+        self.model, self._others = model, others
         self.stiffness = ScanStiffness(model.parameters.stiffness, positive("sigma_stiffness", sigma_stiffness))
         self.refused = 0
         self._used: Slope | None = None
@@ -268,7 +270,8 @@ class PatchCurvature:
         """Gauss–Newton from x (4,) = (q, ln of the stiffness): its last x, and the answer; None without an end."""
         known, mean = np.zeros((4, 4)), np.array([*motion.q, self.stiffness.log])
         known[:3, :3], known[3, 3] = motion.information, self.stiffness.information
-        J, (moments, errors) = np.empty((3, 4)), seen
+        J, (moments, of_way) = np.empty((3, 4)), seen
+        errors: list[Moments] = []
         xx, _, yy = moments
         scale = np.array([xx, math.sqrt(xx * yy), yy])
         step = math.inf
@@ -282,6 +285,8 @@ class PatchCurvature:
                     here = np.array(moments) - scale * r
                     there = self._model(log_stiffness + _STIFFNESS_STEP).moments(k, self.force)
                     J[:, 3] = (there - here) / scale / _STIFFNESS_STEP
+                    others = (other.with_stiffness(math.exp(log_stiffness)) for other in self._others)
+                    errors = [*of_way, *(tuple(other.moments(k, self.force) - here) for other in others)]
                 for error in errors:
                     W = _less_certain(W, moments, error)
                 W *= model.trust(k, self.force)

@@ -28,7 +28,7 @@ import numpy as np
 from canprobe.mechanics.touch.contact import ContactSample
 from canprobe.mechanics.touch.estimate.answer import SurfaceEstimate
 from canprobe.mechanics.touch.online.estimator import AnswerPath, AnswerStage
-from canprobe.mechanics.touch.online.regions import with_errors
+from canprobe.mechanics.touch.online.regions import scaled, with_errors
 from canprobe.mechanics.types import Floats
 
 LAGS = ((0.5, 0.075), (0.1, 0.035))
@@ -55,26 +55,30 @@ class SystematicErrors(AnswerStage):
         drag: error of the way of a contact over the pad, over this way, one standard deviation (`drag_errors`).
         offset: error of the probe's centre along the normal while the probe turns with the surface, m, one standard
             deviation.
+        wider: factor of all standard deviations at last (`regions.beyond_factor`).
     """
 
-    def __init__(self, memory_m: float, *, scale: float = 0.0, drag: float = 0.0, offset: float = 0.0) -> None:
-        self._scale, self._drag, self._offset = scale, drag, offset
+    def __init__(
+        self, memory_m: float, *, scale: float = 0.0, drag: float = 0.0, offset: float = 0.0, wider: float = 1.0
+    ) -> None:
+        self._scale, self._drag, self._offset, self._wider = scale, drag, offset, wider
         self._memory = memory_m
         self._past: deque[tuple[float, Floats]] = deque()
         self._path = AnswerPath()
         self._travelled = 0.0
 
     @classmethod
-    def of_scan(cls, memory_m: float, rolling_share: float, position_sd: float) -> SystematicErrors:
+    def of_scan(cls, memory_m: float, rolling_share: float, position_sd: float, wider: float = 1.0) -> SystematicErrors:
         """The errors of a scan: the pad drags as far as the contact rolls, the tool errs as far as the probe turns.
 
         Args:
             memory_m: path that the motion remembers, m.
             rolling_share: 0 where the probe follows the normal, 1 where it keeps its orientation.
             position_sd: standard deviation of the probe's centre on the flange, per axis, m.
+            wider: factor of all standard deviations at last.
         """
         drag, offset = PAD_DRAG * rolling_share, position_sd * (1.0 - rolling_share)
-        return cls(memory_m, scale=SCALE_ERROR, drag=drag, offset=offset)
+        return cls(memory_m, scale=SCALE_ERROR, drag=drag, offset=offset, wider=wider)
 
     def reset(self) -> None:
         self._past.clear()  # only differences of the path count, so that the path itself goes on
@@ -93,7 +97,7 @@ class SystematicErrors(AnswerStage):
             errors.append(self._offset * tensor.dot(tensor))
         if self._drag != 0.0:
             errors += drag_errors(answer, self._drag)
-        return with_errors(answer, *errors)
+        return scaled(with_errors(answer, *errors), self._wider)
 
     def _lag_errors(self, tensor: Floats) -> Iterator[Floats]:
         """(3, 3) changes of the curvature tensor over the paths by which an answer lags, as far as they are known."""
