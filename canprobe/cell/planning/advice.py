@@ -196,7 +196,8 @@ def _calibration_warnings(array: Array) -> Iterator[str]:
             same = f'; or, if it is that one: sensor.serial_number = "{its}"'
         yield (
             f"sensor.calibration: of the array {of}, and this one {this}: its forces are known to"
-            f" {100 * MAKE_SPREAD:g} % (1σ), as of any array of the make; type: canprobe calibrate array CELL{same}"
+            f" {100 * MAKE_SPREAD:g} % (1σ), and curvature is less certain, as of any array of the make;"
+            f" type: canprobe calibrate array CELL{same}"
         )
 
 

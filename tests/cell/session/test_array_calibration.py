@@ -110,6 +110,12 @@ def test_a_force_beyond_the_calibration_is_less_certain():
     assert math.hypot(at_3, 0.05 * math.log(2.0)) == pytest.approx(at_6)
 
 
+def test_a_speed_beyond_that_of_the_settings_is_told():
+    slow, fast = (make_plan(resolve(load_scene("bowl", {"task.speed_mm_s": v}))).warnings for v in (40.0, 60.0))
+    told = "task.speed_mm_s = 60: what curvature is known to was found up to 40 mm/s; regions are 1.24 times as wide"
+    assert told in fast and not any("was found up to" in line for line in slow)
+
+
 def test_there_are_at_most_forty_touches_and_forces_only_grow_on_an_object():
     every = list(visits(0.025, 0.025, loads=True, one_by_one=True))
     assert sum(len(v.presses) for v in every) <= 40

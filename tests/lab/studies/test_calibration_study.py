@@ -5,11 +5,16 @@ import math
 import numpy as np
 import pytest
 
+from canprobe.cell.plant.taxels import TaxelConfig
+from canprobe.cell.scene.calibrations import load_calibration
+from canprobe.cell.tasks.calibrate import Press
 from canprobe.lab.studies import calibration
+from canprobe.lab.studies.array_presses import Presses, pad_of
 from canprobe.lab.studies.calibration import FAR_RATIO, differences, findings, force_findings, group_of, scan_row
 from canprobe.lab.studies.figure import draw_points
 from canprobe.lab.studies.random_scenes import FOREIGN, SceneSeed
 from canprobe.lab.studies.region_scores import ScoredScan
+from canprobe.mechanics.touch import ForceReading, compute_patch, make_patch_calibration
 
 
 def scan(number, *, foreign, noticed, squares=()):
@@ -55,3 +60,20 @@ def test_points_are_drawn_with_a_mark_for_each_kind(log, tmp_path):
         rows, ("a", "a"), ("b", "b"), tmp_path / "a.png", title="A", by="kind", log=log, lines=((1.0, "a = b"),)
     )
     assert (tmp_path / "a.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("force", "full_scale_pa", "k"), [(0.22, 300e3, 0.0), (0.3, 300e3, 0.0), (0.25, 100e3, 40.0), (8.0, 300e3, 0.0)]
+)
+def test_light_and_heavy_forces_are_within_what_is_stated(force, full_scale_pa, k):
+    """A plane and a ball, and the array that the packaged calibration was made on, at two scales."""
+    presses = Presses(TaxelConfig(full_scale_pa=full_scale_pa), 1.27e8, np.random.default_rng(0))
+    touch = presses.dwell("object", (k, k), Press(force, seconds=2.0))
+    array = make_patch_calibration(load_calibration("inch16"), pad_of(presses.config))
+    reading = ForceReading(array)
+    rows = [
+        reading.step(t, compute_patch(image, array, window))
+        for t, image, window in zip(touch.t_s.tolist(), touch.images, touch.windows, strict=True)
+    ]
+    error = np.mean([row.force for row in rows[-50:]]) - np.mean(presses.forces[-50:])
+    assert abs(error) < 2.0 * rows[-1].sigma.total < 0.4 * force

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from canprobe.mechanics.touch import PatchCurvature, Slope, indentation_from_force
 from canprobe.mechanics.touch.contact import direction_to_pad
+from canprobe.mechanics.touch.estimate.noise import CHI2_95
 from canprobe.mechanics.touch.image.moments import PadMemory
 from canprobe.mechanics.touch.online.patch_curvature import MAX_RECENT_FRAMES, MIN_FRAMES, RECENT_OUTLIER_SHARE, _Mean
 from canprobe.mechanics.touch.online.patch_fusion import patch_estimate
@@ -47,6 +48,18 @@ def test_curvature_of_a_standing_touch_in_base_whatever_the_pad_s_attitude(spin,
     np.testing.assert_allclose(estimate.kappa, [27.8, -6.0], atol=0.02)
     P = estimate.T_frame_contact[:3, :2]
     np.testing.assert_allclose(P @ estimate.K @ P.T, truth, atol=0.02)
+
+
+@pytest.mark.parametrize(("k", "force"), [(20.0, 1.0), (0.0, 3.0)])
+def test_regions_hold_what_an_array_of_the_make_with_another_blur_shows(k, force):
+    array, other = (model(replace(PARAMETERS, blur=share * PARAMETERS.blur)) for share in (1.15, 1.2))
+    touches = samples(k * base_tensor(np.eye(2)), NORMAL, force, lambda q: array.moments(q, force), 20)
+    squares = []
+    for others in ((), (other,)):
+        found = alone(PatchCurvature(model(), others=others), touches)
+        error = np.array(entries(found.K)) - [k, 0.0, k]
+        squares.append(error @ np.linalg.solve(found.covariance, error))
+    assert squares[0] > CHI2_95 > squares[1]
 
 
 def test_axes_are_carried_along_a_contact_that_rolls_and_spins():

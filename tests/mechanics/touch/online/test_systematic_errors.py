@@ -5,7 +5,7 @@ import pytest
 
 from canprobe.mechanics.touch import ContactSample, SystematicErrors, fit_surface
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
-from canprobe.mechanics.touch.online.regions import with_errors
+from canprobe.mechanics.touch.online.regions import BEYOND_FACTOR, FASTEST_M_S, beyond_factor, with_errors
 from canprobe.mechanics.touch.online.systematic_errors import LAGS
 
 MEMORY = 0.02
@@ -90,6 +90,14 @@ def test_a_region_holds_the_curvature_that_a_pad_with_wrong_ways_shows(error):
 
     assert square(scale=0.084) > CHI2_95  # an error that all curvatures have in common does not turn directions
     assert square(drag=0.03) < CHI2_95
+
+
+def test_what_is_beyond_the_settings_widens_all_alike():
+    bare = answer(20.0)
+    found = SystematicErrors(MEMORY, wider=beyond_factor(np.log(2.0), 2.0 * FASTEST_M_S)).refine(bare, SAMPLE)
+    factor = (1.0 + BEYOND_FACTOR * np.log(2.0)) ** 2
+    assert np.allclose(found.covariance, factor**2 * bare.covariance) and np.array_equal(found.K, bare.K)
+    assert beyond_factor(0.0, FASTEST_M_S) == 1.0
 
 
 def test_a_jump_is_doubted_for_as_long_as_the_span():
