@@ -1,7 +1,7 @@
 """Study `regions`: whether the online estimator's 95 % regions hold the truth with the whole sensor on, scene by scene.
 
 Scenes are drawn at random from everything that a cell may meet: five cells, eleven kinds of surfaces from planes to
-rough height fields with radii from 12 mm, weaves, straight paths and circles, 0.5 to 3 N, 5 to 40 mm/s, tool errors,
+rough height fields with radii from 12 mm, weaves, straight paths and circles, 0.2 to 10 N, 3 to 100 mm/s, tool errors,
 arrays with blur, gains, hysteresis and creep of their own. Each is scanned without a bus, with the same numbers, to
 the last bit, as on a lockstep bus whose frames take no time (`bus.timed = false`). Frames that take time make images
 older, and errors of a single scan others. A scene that answers nothing (its plan refuses it, or it is stopped before)
@@ -46,8 +46,8 @@ from canprobe.lab.studies.result import (
 )
 from canprobe.lab.studies.sweep import Sweep
 
-TEST_DRAW = 1
-SCENES, QUICK_SCENES = 60, 3
+TEST_DRAW = 100
+SCENES, QUICK_SCENES = 40, 3
 """Scenes wanted of a kind that yield an estimate, K observed or not."""
 DRAWS_PER_SCENE = 4
 """Largest number of scenes that are drawn for each one that is wanted."""
