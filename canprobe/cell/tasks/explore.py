@@ -218,8 +218,8 @@ def end_of(explorer: Explorer, seconds: float, *, over: bool) -> dict[str, Any]:
         )
     if rough.any():
         causes.append(
-            f"on {100 * rough.mean():.0f} % the contacts contradict a smooth surface: a probe of this radius does not"
-            " touch all of that ground"
+            f"on {100 * rough.mean():.0f} % the contacts contradict a smooth surface: its curvature changes within a"
+            " contact patch, or the probe is too blunt to touch all of that ground"
         )
     if over and ground.wanting.any():
         causes.append(f"the time was over with {100 * ground.wanting.mean():.0f} % still above what can be reached")
