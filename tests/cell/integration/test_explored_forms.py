@@ -1,4 +1,4 @@
-"""Explorations of ridges, steps and bumps that no setting was found on: heights within what is stated, and the true end.
+"""Explorations of ridges, steps and bumps that no setting was found on: heights as stated, ends with their true reason.
 
 A probe of 40 mm touches all of these grounds: nowhere are they as hollow as it is.
 """
