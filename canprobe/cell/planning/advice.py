@@ -7,12 +7,13 @@ from collections.abc import Container, Iterator, Sequence
 
 from canprobe.cell.planning.array import cut_patch, measured_share, patch_across_taxels, support_of
 from canprobe.cell.planning.bridges import BRIDGES
+from canprobe.cell.planning.contact import highest_known_force
 from canprobe.cell.planning.free_parameters import MODES
 from canprobe.cell.planning.model import PlannedPdo
 from canprobe.cell.scene.geometry import mesh_warnings
 from canprobe.cell.scene.rules import SECTIONS_OF_TASK
 from canprobe.cell.scene.setup import Arm, Array, Calibrate, Setup, Touch, Touching
-from canprobe.errors import install_line
+from canprobe.errors import at_most, install_line
 from canprobe.fieldbus.bus.real.adapters import bus_open_to_others
 from canprobe.fieldbus.protocol.frame_bits import WORST_ERROR_BITS
 
@@ -162,7 +163,7 @@ def _open_to_others(setup: Setup) -> Iterator[str]:
         )
 
 
-def _calibration_warnings(array: Array) -> Iterator[str]:
+def _calibration_warnings(array: Array, setup: Setup) -> Iterator[str]:
     """Warnings of what the calibration of an array does not state, and of what is taken for it."""
     from canprobe.mechanics.touch.image.calibration import NO_FORCE_REFERENCE
     from canprobe.mechanics.touch.image.force_errors import MAKE_SPREAD, UNSTATED
@@ -189,14 +190,18 @@ def _calibration_warnings(array: Array) -> Iterator[str]:
     if array.calibrated and array.calibration.of_make:
         its, name = array.calibration.serial_number, array.serial if array.raw is None else array.raw.serial
         of = its if isinstance(its, str) else f"{its:#x}"
-        this, same = "has no name", ""
+        this, same, usable = "has no name", "", ""
         if name is not None:
             this = f"is {name:#x} (1018h:04)" if isinstance(name, int) else f"is {name}"
         if array.raw is not None:
             same = f'; or, if it is that one: sensor.serial_number = "{its}"'
+        if (touch := setup.touch) is not None:
+            limit = setup.limits.force_max
+            highest = highest_known_force(array, touch.probe, limit, (0.0, touch.duration_s))
+            usable = f", so that {at_most(highest)} N may be at limits.force_max_n = {limit:g}"
         yield (
             f"sensor.calibration: of the array {of}, and this one {this}: its forces are known to"
-            f" {100 * MAKE_SPREAD:g} % (1σ), and curvature is less certain, as of any array of the make;"
+            f" {100 * MAKE_SPREAD:g} % (1σ){usable}, and curvature is less certain, as of any array of the make;"
             f" type: canprobe calibrate array CELL{same}"
         )
 
@@ -221,7 +226,7 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
             " for emulated nodes"
         )
     if setup.array is not None:
-        yield from _calibration_warnings(setup.array)
+        yield from _calibration_warnings(setup.array, setup)
     if setup.touch is not None:
         yield from _beyond_what_is_known(setup.touch)
     if (cut := cut_patch(setup)) is not None:

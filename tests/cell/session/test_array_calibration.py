@@ -23,7 +23,7 @@ from canprobe.cell.session.array_calibration import KnownObject, Visit, touch_ob
 from canprobe.cell.session.session import Session
 from canprobe.cell.tasks.calibrate import Press
 from canprobe.cli import main
-from canprobe.errors import NodeError, SceneError
+from canprobe.errors import NodeError, PlanError, SceneError
 
 AT = (-120.0, -122.5, 374.0)
 
@@ -97,6 +97,17 @@ def test_an_array_that_is_no_node_has_a_name_in_the_cell_file(tmp_path):
     assert "of the array left, and this one is right: its forces" in " ".join(make_plan(other).warnings)
     with pytest.raises(SceneError, match=r"sensor\.serial_number: expected the number of 1018h:04.*got 'left'"):
         load_scene("press", {"sensor.serial_number": "left"})
+
+
+def test_the_plan_states_which_force_of_an_array_of_the_make_may_be_at_the_limit(tmp_path):
+    file = tmp_path / "mine.toml"
+    text = packaged_files("calibrations")["inch16"].read_text()
+    file.write_text(text.replace("\n[image]", "serial_number = 1\n\n[image]"))
+    keys = {"sensor.calibration": str(file), "sensor.serial_number": 2}
+    (told,) = (line for line in make_plan(resolve(load_scene("press", keys))).warnings if "of the array 0x1" in line)
+    assert "known to 10 % (1σ), so that 4.14 N may be at limits.force_max_n = 5, and curvature is less" in told
+    with pytest.raises(PlanError, match=r"task.force_n = 4.5: .* lower task.force_n to 4\.0"):
+        make_plan(resolve(load_scene("press", {**keys, "task.force_n": 4.5})))
 
 
 def test_a_force_beyond_the_calibration_is_less_certain():
