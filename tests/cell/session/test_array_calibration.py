@@ -106,7 +106,7 @@ def test_the_plan_states_which_force_of_an_array_of_the_make_may_be_at_the_limit
     keys = {"sensor.calibration": str(file), "sensor.serial_number": 2}
     (told,) = (line for line in make_plan(resolve(load_scene("press", keys))).warnings if "of the array 0x1" in line)
     assert "known to 10 % (1σ), so that 4.14 N may be at limits.force_max_n = 5, and curvature is less" in told
-    with pytest.raises(PlanError, match=r"task.force_n = 4.5: .* lower task.force_n to 4\.0"):
+    with pytest.raises(PlanError, match=r"task.force_n = 4.5: .* lower task.force_n to 4\.1"):
         make_plan(resolve(load_scene("press", {**keys, "task.force_n": 4.5})))
 
 
