@@ -30,7 +30,6 @@ from canprobe.fieldbus.eds.packaged import check_eds, load_eds
 from canprobe.fieldbus.tools import reports
 
 if TYPE_CHECKING:
-    from canprobe.fieldbus.eds.description import Description
     from canprobe.fieldbus.tools.conform import Examination, Point
 
 HELP = "examine a device of any maker for conformance"
@@ -93,11 +92,12 @@ def run(args: argparse.Namespace) -> int:
     if args.node is None:
         how = "any, such as --node 1" if args.bus == "lockstep" else "`canprobe scan` lists the nodes on a bus"
         raise UsageError(f"conform: --node N names the device; {how}")
+    from canprobe.fieldbus.eds.description import Description
     from canprobe.fieldbus.tools.conform import Examination, ExaminationSettings, WriteList, restore_snapshot
     from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 
-    points, description = _points(args), _description(args)
-    baseline = read_baseline(args)
+    points, baseline = _points(args), read_baseline(args)
+    description = None if args.eds is None else Description(load_eds(args.eds, args.node))
     times = BenchTimes(sdo_s=args.timeout, slack_s=_REAL_SLACK_S)
     if args.motion:
         _confirm(args)
@@ -164,12 +164,6 @@ def _points(args: argparse.Namespace) -> tuple[Point, ...]:
 
         points = (*POINTS, *read_points(args.own))
     return chosen_points(points, (args.points or "").split(","))
-
-
-def _description(args: argparse.Namespace) -> Description | None:
-    from canprobe.fieldbus.eds.description import Description
-
-    return None if args.eds is None else Description(load_eds(args.eds, args.node))
 
 
 @contextlib.contextmanager
