@@ -229,9 +229,7 @@ class VirtualTimeBus(EmulatedBus):
         return PortNetwork(self.port())
 
     def port(self) -> Port:
-        port = self._bus.port()
-        self._stack.callback(port.close)
-        return port
+        return self._stack.enter_context(closing(self._bus.port()))
 
     def _attach(self, nodes: Sequence[FaultyNode]) -> None:
         for node in nodes:

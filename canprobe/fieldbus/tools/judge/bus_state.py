@@ -103,7 +103,7 @@ class BusState:
             for event in self._channels[node.node_id].from_client(frame):
                 if isinstance(event, events.RequestSeen):
                     node.asked = True
-                    node.touch(event.place[0])
+                    node.touched.add(event.place[0])
                 yield event
             return
         yield from self._sent_by(node, frame)
@@ -180,10 +180,8 @@ class BusState:
         if not isinstance(event, events.AnswerSeen) or event.late:
             return
         node = event.node
-        if event.writes and event.place[0] == _STORE:
-            node.stored = True
-        if event.writes:
-            node.configured = True
+        node.configured = node.configured or event.writes
+        node.stored = node.stored or (event.writes and event.place[0] == _STORE)
         if event.value is None:
             return
         shown = event.request if event.writes else event.frame

@@ -96,6 +96,7 @@ class SeenNode:
         syncs: number of SYNCs since then.
         heartbeats_ns: times of the last heartbeats.
         addressed: whether the master has sent anything to this node.
+        touched: indices of the objects that the master has read or written.
         configured: whether the master has written an object by SDO.
         rpdos, tpdos: valid PDOs by COB-ID.
         rpdo_counts: number of frames by number of the RPDO since the last boot-up.
@@ -111,7 +112,7 @@ class SeenNode:
         self.started_ns: int | None = None
         self.syncs = 0
         self.heartbeats_ns: deque[int] = deque(maxlen=8)
-        self._touched: set[int] = set()
+        self.touched: set[int] = set()
         self._known: dict[Place, Known] = {}
         self.rpdo_counts: Counter[int] = Counter()
         self.rpdos: dict[int, PdoView] = {}
@@ -151,9 +152,8 @@ class SeenNode:
 
     def value(self, index: int, subindex: int = 0) -> int | None:
         """The last value that passed, or else that of the EDS; None where neither has one."""
-        found = self._known.get((index, subindex))
-        if found is not None:
-            return found.value
+        if (passed := self.number(index, subindex)) is not None:
+            return passed
         entry = self._description.entry(index, subindex)
         return entry.initial if entry is not None and isinstance(entry.initial, int) else None
 
@@ -163,7 +163,7 @@ class SeenNode:
 
     def is_sure(self, index: int) -> bool:
         """Whether `value` is true of the device: it passed on the bus, the node has booted, or it is served here."""
-        return self._served or self.booted or index in self._touched
+        return self._served or self.booted or index in self.touched
 
     def take(self, place: Place, value: int, frame: BusFrame) -> None:
         """Take the value of an object, written or read. A mode that is asked for again keeps its first time."""
@@ -173,10 +173,6 @@ class SeenNode:
             self.read_pdos()
         if place[0] == cia402.POSITION:
             self.positions.append((frame.t_ns, value))
-
-    def touch(self, index: int) -> None:
-        """Note that the master has read or written an object."""
-        self._touched.add(index)
 
     def value_of(self, place: Place, data: bytes) -> int | None:
         """The number in the bytes of an object; None where it is none."""
@@ -209,7 +205,7 @@ class SeenNode:
                 layout = PdoLayout(cob_id & 0x7FF, entries, self.value(index, 2) or 0)
             except ProtocolError:
                 continue
-            touched = {index, index + TO_MAPPING} & self._touched
+            touched = {index, index + TO_MAPPING} & self.touched
             certain = self._served or len(touched) == 2
             found[layout.cob_id] = PdoView(number, layout, self.value(index, 5) or 0, certain, bool(touched))
         return found
