@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +30,7 @@ from canprobe.fieldbus.eds.packaged import check_eds, load_eds
 from canprobe.fieldbus.tools import reports
 
 if TYPE_CHECKING:
-    from canprobe.fieldbus.tools.conform import Examination, Point
+    from canprobe.fieldbus.tools.conform import Point
 
 HELP = "examine a device of any maker for conformance"
 EXAMPLE = """\
@@ -98,15 +98,15 @@ def run(args: argparse.Namespace) -> int:
 
     points, baseline = _points(args), read_baseline(args)
     description = None if args.eds is None else Description(load_eds(args.eds, args.node))
-    times = BenchTimes(sdo_s=args.timeout, slack_s=_REAL_SLACK_S)
-    if args.motion:
-        _confirm(args)
+    times, virtual = BenchTimes(sdo_s=args.timeout, slack_s=_REAL_SLACK_S), args.bus == "lockstep"
+    question = f"node {args.node} will be switched on and its axis will move: is everybody out of its way?"
+    if args.motion and not (args.yes or virtual or yes_typed(question)):
+        raise UsageError("conform: --motion needs a yes at the terminal, or --yes")
     with _port(args) as port:
         if args.restore is not None:
             restored = restore_snapshot(port, args.node, args.restore, times)
             print_answer(args, {"restored": restored}, "\n".join(restored))
             return 0
-        virtual = args.bus == "lockstep"
         settings = ExaminationSettings(
             written=WriteList.parse(args.write),
             motion=args.motion,
@@ -118,19 +118,14 @@ def run(args: argparse.Namespace) -> int:
             times=BenchTimes() if virtual else times,
             ask=yes_typed if sys.stdin.isatty() else None,
         )
-        report = _examine(args, Examination(port, args.node, description, settings), points)
-    return _finish(args, report, baseline)
-
-
-def _examine(args: argparse.Namespace, examination: Examination, points: Sequence[Point]) -> reports.Report:
-    """Run the examination, with its progress on stderr."""
-    bar = args.report.bar(".0f points") or nothing
-    examination.report.facts.update(_bench_facts(args))
-    report = examination.run(points, lambda _row, number, total: bar(number, total))
+        examination = Examination(port, args.node, description, settings)
+        examination.report.facts.update(_bench_facts(args))
+        bar = args.report.bar(".0f points") or nothing
+        report = examination.run(points, lambda _row, number, total: bar(number, total))
     report.log = None if args.log is None else str(args.log)
     if "warning" in report.facts:
         args.report.say(f"warning: {report.facts['warning']}")
-    return report
+    return _finish(args, report, baseline)
 
 
 def _finish(args: argparse.Namespace, report: reports.Report, baseline: reports.Report | None) -> int:
@@ -145,25 +140,18 @@ def _finish(args: argparse.Namespace, report: reports.Report, baseline: reports.
     if args.full:
         print("", *map(reports.row_text, report.rows), reports.closing_text(report), sep="\n")
     else:
-        print(f"all points: type it again with --full, or --html FILE for the frames{_again(report)}")
+        failed = dict.fromkeys(row.group for row in report.rows if row.verdict is reports.Verdict.FAIL)
+        again = f"; after a change --points {','.join(failed)}" if failed else ""
+        print(f"all points: type it again with --full, or --html FILE for the frames{again}")
     return report.exit_status
 
 
-def _again(report: reports.Report) -> str:
-    """How to examine again what failed."""
-    groups = dict.fromkeys(row.group for row in report.rows if row.verdict is reports.Verdict.FAIL)
-    return f"; after a change --points {','.join(groups)}" if groups else ""
-
-
 def _points(args: argparse.Namespace) -> tuple[Point, ...]:
+    from canprobe.fieldbus.tools.conform.own_points import read_points
     from canprobe.fieldbus.tools.conform.registry import POINTS, chosen_points
 
-    points = POINTS
-    if args.own is not None:
-        from canprobe.fieldbus.tools.conform.own_points import read_points
-
-        points = (*POINTS, *read_points(args.own))
-    return chosen_points(points, (args.points or "").split(","))
+    own = () if args.own is None else read_points(args.own)
+    return chosen_points((*POINTS, *own), (args.points or "").split(","))
 
 
 @contextlib.contextmanager
@@ -214,18 +202,6 @@ def _bench_facts(args: argparse.Namespace) -> dict[str, str]:
         facts["EDS check"] = f"{len(reading.faults)} faults, {len(reading.warnings)} warnings; canprobe eds check"
         facts["EDS"] = eds_and_hash(args.eds)
     return facts
-
-
-def _confirm(args: argparse.Namespace) -> None:
-    """Let somebody confirm that the axis may move.
-
-    Raises:
-        UsageError: nobody did.
-    """
-    if args.yes or args.bus == "lockstep":
-        return
-    if not yes_typed(f"node {args.node} will be switched on and its axis will move: is everybody out of its way?"):
-        raise UsageError("conform: --motion needs a yes at the terminal, or --yes")
 
 
 def _list(args: argparse.Namespace) -> int:
