@@ -9,14 +9,14 @@ from __future__ import annotations
 import struct
 import threading
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from contextlib import ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack, closing
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Self, TypeVar
+from typing import TypeVar
 
 import canopen
 
@@ -51,7 +51,7 @@ def _answer(future: Future[T], act: Callable[[], T]) -> None:
         future.set_exception(error)
 
 
-class EmulatedBus(ABC):
+class EmulatedBus(AbstractContextManager["EmulatedBus"]):
     """The bus of a test. A context manager; leaving it closes everything on it.
 
     Args:
@@ -145,9 +145,6 @@ class EmulatedBus(ABC):
     @abstractmethod
     def _act(self, node_id: int, act: Callable[[], T]) -> T:
         """Do something to a node, or to the log (0), between two frames."""
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._stack.close()

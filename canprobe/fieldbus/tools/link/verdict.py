@@ -103,9 +103,7 @@ class LinkVerdict:
         return {
             "verdict": str(self.fitness),
             "rate_hz": self.rate_hz,
-            "cause": self.cause or None,
-            "why": self.why or None,
-            "way_out": self.way_out or None,
+            **{name: getattr(self, name) or None for name in ("cause", "why", "way_out")},
             "fit_rate_hz": self.fit_rate_hz,
             "overruns_percent": {f"{rate:g}": 100.0 * share for rate, share in self.overruns.items()},
         }

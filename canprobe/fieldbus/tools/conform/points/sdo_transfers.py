@@ -194,8 +194,7 @@ def block_upload(bench: Bench) -> None:
 @point(23, "acknowledgement of 128", BLOCKS, accepted.SEQUENCE)
 def acknowledgement_of_128(bench: Bench) -> None:
     """A block upload, of which more segments are acknowledged than a block can have."""
-    index = _text_index(bench)
-    _block_segments(bench, index)
+    _block_segments(bench, _text_index(bench))
     acknowledgement = bytes((0xA2, 128, 127)) + bytes(5)
     _must_end_transfer(bench, acknowledgement, accepted.SEQUENCE, "an acknowledgement of 128 segments")
 
