@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from canprobe.cli.argument_types import seconds, whole, word
 from canprobe.cli.output import print_answer, print_json, print_table
 from canprobe.cli.parser import Parser
-from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
+from canprobe.cli.reports import add_report_options, bench_facts, eds_and_hash, read_baseline, write_report
 from canprobe.cli.stdin import yes_typed
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
@@ -189,14 +189,10 @@ def _emulated(args: argparse.Namespace) -> Port:
 
 def _bench_facts(args: argparse.Namespace) -> dict[str, str]:
     """What the report says of the bench."""
-    facts = {
-        "command": command_line(),
-        "adapter": args.bus or "socketcan",
-        "bit rate": f"{args.bitrate or 1_000_000} bit/s" if args.bus != "lockstep" else "virtual time",
-        "versions": versions(),
-        "permitted": ", ".join(filter(None, [args.write, "motion" if args.motion else ""]))
-        or "nothing beyond the default",
-    }
+    rate = f"{args.bitrate or 1_000_000} bit/s" if args.bus != "lockstep" else "virtual time"
+    facts = bench_facts({"adapter": args.bus or "socketcan", "bit rate": rate})
+    permitted = ", ".join(filter(None, [args.write, "motion" if args.motion else ""]))
+    facts["permitted"] = permitted or "nothing beyond the default"
     if args.eds is not None:
         reading = check_eds(args.eds, args.node)
         facts["EDS check"] = f"{len(reading.faults)} faults, {len(reading.warnings)} warnings; canprobe eds check"

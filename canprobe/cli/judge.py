@@ -24,7 +24,7 @@ from canprobe.cli.emulate import eds_files
 from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
 from canprobe.cli.output import print_answer, print_json, print_table, say
 from canprobe.cli.parser import Parser
-from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
+from canprobe.cli.reports import add_report_options, bench_facts, eds_and_hash, read_baseline, write_report
 from canprobe.cli.target import loaded, one_channel, real_target, scene_target
 from canprobe.errors import UsageError
 from canprobe.fieldbus.eds.packaged import load_eds
@@ -253,7 +253,7 @@ def _report_of(
 
 def _facts(args: argparse.Namespace) -> dict[str, str]:
     """What the report says of the bench."""
-    facts = {"command": command_line(), "bit rate": f"{args.bitrate or 1_000_000} bit/s", "versions": versions()}
+    facts = bench_facts({"bit rate": f"{args.bitrate or 1_000_000} bit/s"})
     for name, one in zip(args.eds, args.node_id, strict=False):
         facts[f"EDS of node {one}"] = eds_and_hash(name)
     return facts
