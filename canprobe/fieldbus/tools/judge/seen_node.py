@@ -183,8 +183,7 @@ class SeenNode:
             return None
         if entry is not None and 0 < entry.bits < 8 * len(data):
             data = data[: (entry.bits + 7) // 8]
-        signed = entry.signed if entry is not None else place[0] in _SIGNED
-        return int.from_bytes(data, "little", signed=signed)
+        return int.from_bytes(data, "little", signed=self._is_signed(place))
 
     def read_pdos(self) -> None:
         """Read the PDOs anew from their parameters."""
@@ -200,7 +199,7 @@ class SeenNode:
             if cob_id is None or cob_id & INVALID_FLAG or not count or count > 64:
                 continue
             words = [self.value(index + TO_MAPPING, sub) or 0 for sub in range(1, count + 1)]
-            entries = tuple(PdoEntry.from_word(word, self._is_signed(word)) for word in words)
+            entries = tuple(PdoEntry.from_word(word, self._is_signed((word >> 16, word >> 8 & 0xFF))) for word in words)
             try:
                 layout = PdoLayout(cob_id & 0x7FF, entries, self.value(index, 2) or 0)
             except ProtocolError:
@@ -210,9 +209,9 @@ class SeenNode:
             found[layout.cob_id] = PdoView(number, layout, self.value(index, 5) or 0, certain, bool(touched))
         return found
 
-    def _is_signed(self, word: int) -> bool:
-        entry = self._description.entry(word >> 16, word >> 8 & 0xFF)
-        return entry.signed if entry is not None else word >> 16 in _SIGNED
+    def _is_signed(self, place: Place) -> bool:
+        entry = self._description.entry(*place)
+        return entry.signed if entry is not None else place[0] in _SIGNED
 
     @property
     def is_drive(self) -> bool:
