@@ -57,8 +57,6 @@ CHANGES = 4
 """Changes of nodes and drives that are shown."""
 READ = {"voltage_v": "V", "temperature_c": "°C"}
 """Units of what is read of a drive, by its name."""
-_FIRST_STATE: dict[str, Any] = {"state": "starts", "joints": (), "step": 1.0, "speed_percent": 10.0, "frame": "base"}
-"""State until the cell has printed one."""
 BAR = 12
 """Width of the bar of a joint's range, characters."""
 
@@ -101,7 +99,13 @@ class ConsoleScreen(App[int]):
     def __init__(self, cell: subprocess.Popen[bytes]) -> None:
         super().__init__()
         self._cell, self._text, self._open = cell, b"", True
-        self.state = dict(_FIRST_STATE)
+        self.state: dict[str, Any] = {
+            "state": "starts",
+            "joints": (),
+            "step": 1.0,
+            "speed_percent": 10.0,
+            "frame": "base",
+        }
         self._chosen = "1"
         self._history: list[str] = []
         self._recalled = 0

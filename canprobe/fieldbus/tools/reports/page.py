@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import statistics
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -117,11 +116,14 @@ def _times(distributions: dict[str, tuple[float, ...]]) -> str:
 def _histogram(times: Sequence[float]) -> str:
     """Bars of how often each time came."""
     least, span = min(times), max(times) - min(times)
-    bars = Counter(min(int((one - least) / span * _BARS), _BARS - 1) if span > 0 else 0 for one in times)
-    height = 28 / max(bars.values())
+    bars = [0] * _BARS
+    for one in times:
+        bars[min(int((one - least) / span * _BARS), _BARS - 1) if span > 0 else 0] += 1
+    height = 28 / max(bars)
     rects = "".join(
         f'<rect x="{4 * number}" y="{30 - height * bar:.1f}" width="3" height="{height * bar:.1f}"/>'
-        for number, bar in sorted(bars.items())
+        for number, bar in enumerate(bars)
+        if bar
     )
     return f'<svg width="{4 * _BARS}" height="30" role="img" aria-label="histogram">{rects}</svg>'
 
