@@ -8,6 +8,14 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+
+_SCENES = ("scene", ("toml",))
+_COMPLETED: dict[str, tuple[str, tuple[str, ...]]] = {
+    **{"scene": _SCENES, "what": _SCENES, "cell": ("cell", ("toml",)), "eds": ("eds", ("eds", "dcf"))},
+    **{"bus": ("bus", ()), "bridge": ("bridge", ()), "name": ("study", ())},
+}
+"""Kind of the names of an argument, and the endings of the files that could stand in their place."""
 
 
 def complete(parser_of: Callable[[Sequence[str]], argparse.ArgumentParser], commands: Sequence[str]) -> None:
@@ -24,8 +32,8 @@ def complete(parser_of: Callable[[Sequence[str]], argparse.ArgumentParser], comm
     typed = os.environ.get("COMP_LINE", "").split(" ")[1:-1]
     parser = parser_of([word for word in typed if word in commands][:1])
     for action in _actions(parser):
-        if action.dest in _NAMES and action.choices is None:
-            action.completer = _NAMES[action.dest]  # type: ignore[attr-defined]
+        if action.dest in _COMPLETED and action.choices is None:
+            action.completer = partial(_completed, *_COMPLETED[action.dest])  # type: ignore[attr-defined]
     argcomplete.autocomplete(parser)
 
 
@@ -37,59 +45,35 @@ def _actions(parser: argparse.ArgumentParser) -> Iterable[argparse.Action]:
                 yield from _actions(inner)
 
 
-class _Completer:
-    """Names, and the files that could stand in their place."""
+def _completed(kind: str, endings: Sequence[str], prefix: str, **_: object) -> list[str]:
+    """Names of a kind, and the files that could stand in their place."""
+    from argcomplete.completers import FilesCompleter
 
-    def __init__(self, names: Callable[[], Iterable[str]], endings: Sequence[str] | None = None) -> None:
-        self._names, self._endings = names, endings
-
-    def __call__(self, prefix: str, **_: object) -> list[str]:
-        from argcomplete.completers import FilesCompleter
-
-        files = () if self._endings is None else FilesCompleter(self._endings)(prefix)
-        return [*(name for name in self._names() if name.startswith(prefix)), *files]
+    files = FilesCompleter(endings)(prefix) if endings else ()
+    return [*(name for name in _names(kind) if name.startswith(prefix)), *files]
 
 
-def _packaged(kind: str) -> Callable[[], Iterable[str]]:
-    def names() -> Iterable[str]:
-        from canprobe.cell.scene.load import packaged_files
-        from canprobe.cell.scene.plugins import plugins
+def _names(kind: str) -> Iterable[str]:
+    """All names of a kind; what knows them is imported for that kind only."""
+    match kind:
+        case "bus":
+            from canprobe.fieldbus.bus.real.adapters import interface_names
 
-        return [*packaged_files(f"{kind}s"), *(plugin.name for plugin in plugins(kind))]
+            return ("lockstep", "direct", "config", *interface_names())
+        case "bridge":
+            from canprobe.cell.planning.bridges import BRIDGES
 
-    return names
+            return BRIDGES
+        case "study":
+            from canprobe.lab.studies.sweep import STUDIES
 
+            return STUDIES
+        case "eds":
+            from canprobe.fieldbus.eds.packaged import eds_names
 
-def _buses() -> Iterable[str]:
-    from canprobe.fieldbus.bus.real.adapters import interface_names
+            return eds_names()
+        case _:
+            from canprobe.cell.scene.load import packaged_files
+            from canprobe.cell.scene.plugins import plugins
 
-    return ("lockstep", "direct", "config", *interface_names())
-
-
-def _bridges() -> Iterable[str]:
-    from canprobe.cell.planning.bridges import BRIDGES
-
-    return BRIDGES
-
-
-def _studies() -> Iterable[str]:
-    from canprobe.lab.studies.sweep import STUDIES
-
-    return STUDIES
-
-
-def _eds() -> Iterable[str]:
-    from canprobe.fieldbus.eds.packaged import eds_names
-
-    return eds_names()
-
-
-_NAMES = {
-    "scene": _Completer(_packaged("scene"), ("toml",)),
-    "what": _Completer(_packaged("scene"), ("toml",)),
-    "cell": _Completer(_packaged("cell"), ("toml",)),
-    "bus": _Completer(_buses),
-    "bridge": _Completer(_bridges),
-    "eds": _Completer(_eds, ("eds", "dcf")),
-    "name": _Completer(_studies),
-}
+            return [*packaged_files(f"{kind}s"), *(plugin.name for plugin in plugins(kind))]

@@ -14,14 +14,14 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.argument_types import seconds, whole, word
 from canprobe.cli.output import print_answer, print_json, print_table
 from canprobe.cli.parser import Parser
-from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
+from canprobe.cli.reports import add_report_options, bench_facts, eds_and_hash, read_baseline, write_report
 from canprobe.cli.stdin import yes_typed
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
@@ -30,8 +30,7 @@ from canprobe.fieldbus.eds.packaged import check_eds, load_eds
 from canprobe.fieldbus.tools import reports
 
 if TYPE_CHECKING:
-    from canprobe.fieldbus.eds.description import Description
-    from canprobe.fieldbus.tools.conform import Examination, Point
+    from canprobe.fieldbus.tools.conform import Point
 
 HELP = "examine a device of any maker for conformance"
 EXAMPLE = """\
@@ -93,20 +92,21 @@ def run(args: argparse.Namespace) -> int:
     if args.node is None:
         how = "any, such as --node 1" if args.bus == "lockstep" else "`canprobe scan` lists the nodes on a bus"
         raise UsageError(f"conform: --node N names the device; {how}")
+    from canprobe.fieldbus.eds.description import Description
     from canprobe.fieldbus.tools.conform import Examination, ExaminationSettings, WriteList, restore_snapshot
     from canprobe.fieldbus.tools.conform.frame_link import BenchTimes
 
-    points, description = _points(args), _description(args)
-    baseline = read_baseline(args)
-    times = BenchTimes(sdo_s=args.timeout, slack_s=_REAL_SLACK_S)
-    if args.motion:
-        _confirm(args)
+    points, baseline = _points(args), read_baseline(args)
+    description = None if args.eds is None else Description(load_eds(args.eds, args.node))
+    times, virtual = BenchTimes(sdo_s=args.timeout, slack_s=_REAL_SLACK_S), args.bus == "lockstep"
+    question = f"node {args.node} will be switched on and its axis will move: is everybody out of its way?"
+    if args.motion and not (args.yes or virtual or yes_typed(question)):
+        raise UsageError("conform: --motion needs a yes at the terminal, or --yes")
     with _port(args) as port:
         if args.restore is not None:
             restored = restore_snapshot(port, args.node, args.restore, times)
             print_answer(args, {"restored": restored}, "\n".join(restored))
             return 0
-        virtual = args.bus == "lockstep"
         settings = ExaminationSettings(
             written=WriteList.parse(args.write),
             motion=args.motion,
@@ -118,19 +118,14 @@ def run(args: argparse.Namespace) -> int:
             times=BenchTimes() if virtual else times,
             ask=yes_typed if sys.stdin.isatty() else None,
         )
-        report = _examine(args, Examination(port, args.node, description, settings), points)
-    return _finish(args, report, baseline)
-
-
-def _examine(args: argparse.Namespace, examination: Examination, points: Sequence[Point]) -> reports.Report:
-    """Run the examination, with its progress on stderr."""
-    bar = args.report.bar(".0f points") or nothing
-    examination.report.facts.update(_bench_facts(args))
-    report = examination.run(points, lambda _row, number, total: bar(number, total))
+        examination = Examination(port, args.node, description, settings)
+        examination.report.facts.update(_bench_facts(args))
+        bar = args.report.bar(".0f points") or nothing
+        report = examination.run(points, lambda _row, number, total: bar(number, total))
     report.log = None if args.log is None else str(args.log)
     if "warning" in report.facts:
         args.report.say(f"warning: {report.facts['warning']}")
-    return report
+    return _finish(args, report, baseline)
 
 
 def _finish(args: argparse.Namespace, report: reports.Report, baseline: reports.Report | None) -> int:
@@ -145,31 +140,18 @@ def _finish(args: argparse.Namespace, report: reports.Report, baseline: reports.
     if args.full:
         print("", *map(reports.row_text, report.rows), reports.closing_text(report), sep="\n")
     else:
-        print(f"all points: type it again with --full, or --html FILE for the frames{_again(report)}")
+        failed = dict.fromkeys(row.group for row in report.rows if row.verdict is reports.Verdict.FAIL)
+        again = f"; after a change --points {','.join(failed)}" if failed else ""
+        print(f"all points: type it again with --full, or --html FILE for the frames{again}")
     return report.exit_status
 
 
-def _again(report: reports.Report) -> str:
-    """How to examine again what failed."""
-    groups = dict.fromkeys(row.group for row in report.rows if row.verdict is reports.Verdict.FAIL)
-    return f"; after a change --points {','.join(groups)}" if groups else ""
-
-
 def _points(args: argparse.Namespace) -> tuple[Point, ...]:
+    from canprobe.fieldbus.tools.conform.own_points import read_points
     from canprobe.fieldbus.tools.conform.registry import POINTS, chosen_points
 
-    points = POINTS
-    if args.own is not None:
-        from canprobe.fieldbus.tools.conform.own_points import read_points
-
-        points = (*POINTS, *read_points(args.own))
-    return chosen_points(points, (args.points or "").split(","))
-
-
-def _description(args: argparse.Namespace) -> Description | None:
-    from canprobe.fieldbus.eds.description import Description
-
-    return None if args.eds is None else Description(load_eds(args.eds, args.node))
+    own = () if args.own is None else read_points(args.own)
+    return chosen_points((*POINTS, *own), (args.points or "").split(","))
 
 
 @contextlib.contextmanager
@@ -207,31 +189,15 @@ def _emulated(args: argparse.Namespace) -> Port:
 
 def _bench_facts(args: argparse.Namespace) -> dict[str, str]:
     """What the report says of the bench."""
-    facts = {
-        "command": command_line(),
-        "adapter": args.bus or "socketcan",
-        "bit rate": f"{args.bitrate or 1_000_000} bit/s" if args.bus != "lockstep" else "virtual time",
-        "versions": versions(),
-        "permitted": ", ".join(filter(None, [args.write, "motion" if args.motion else ""]))
-        or "nothing beyond the default",
-    }
+    rate = f"{args.bitrate or 1_000_000} bit/s" if args.bus != "lockstep" else "virtual time"
+    facts = bench_facts({"adapter": args.bus or "socketcan", "bit rate": rate})
+    permitted = ", ".join(filter(None, [args.write, "motion" if args.motion else ""]))
+    facts["permitted"] = permitted or "nothing beyond the default"
     if args.eds is not None:
         reading = check_eds(args.eds, args.node)
         facts["EDS check"] = f"{len(reading.faults)} faults, {len(reading.warnings)} warnings; canprobe eds check"
         facts["EDS"] = eds_and_hash(args.eds)
     return facts
-
-
-def _confirm(args: argparse.Namespace) -> None:
-    """Let somebody confirm that the axis may move.
-
-    Raises:
-        UsageError: nobody did.
-    """
-    if args.yes or args.bus == "lockstep":
-        return
-    if not yes_typed(f"node {args.node} will be switched on and its axis will move: is everybody out of its way?"):
-        raise UsageError("conform: --motion needs a yes at the terminal, or --yes")
 
 
 def _list(args: argparse.Namespace) -> int:

@@ -169,7 +169,11 @@ class HandSession:
         try:
             action()
         except (SafetyStop, NodeError) as error:
-            self._stop_for(error)
+            self.questions.stop(str(error))
+            self.motions.forget_pause()
+            self.errands.waiting.clear()
+            self._show(f"stopped: {error}")
+            self._show("look at the arm; `reset` asks whether it may move again")
         except (UsageError, ResultsError, argparse.ArgumentTypeError) as error:
             self._show(str(error))
 
@@ -201,13 +205,6 @@ class HandSession:
         if not self.ended:
             self._cell.cell.disable()
             self._show("the drives are disabled")
-
-    def _stop_for(self, error: Exception) -> None:
-        self.questions.stop(str(error))
-        self.motions.forget_pause()
-        self.errands.waiting.clear()
-        self._show(f"stopped: {error}")
-        self._show("look at the arm; `reset` asks whether it may move again")
 
     def _resume(self) -> None:
         with contextlib.suppress(UsageError):  # the drives could not be enabled, and nothing ran

@@ -190,8 +190,7 @@ def template_cell(args: argparse.Namespace) -> str:
     )
     if args.eds:
         text = text.replace("[arm]\n", f"[bus]\nbitrate = {_common_bitrate(args.eds)}\n\n[arm]\n", 1)
-        eds = _common_eds(args.eds, 6)
-        text = text.replace('eds = "puma260_joint.eds"\n', eds)
+        text = text.replace('eds = "puma260_joint.eds"\n', _common_eds(args.eds, 6))
         if len(args.eds) == 6:
             for number, path in enumerate(args.eds, start=1):
                 text = text.replace(f"node_id = {number}\n", f'node_id = {number}\neds = "{path.name}"\n')

@@ -77,8 +77,7 @@ def _touch(model: ArmModel, q: Floats, T_flange_probe: Floats, speed: float, len
     pole, place = T[:3, 2], 1e3 * T[:3, 3]
     fixed = task_rows(model) == FIXED_POLE
     normal = -pole if not fixed or abs(pole[2]) < 0.99 else np.array((0.0, 0.0, -math.copysign(1.0, pole[2])))
-    start = place - 45.0 * normal
-    rows = ", ".join(f"{value:.1f}" for value in start)
+    rows = ", ".join(f"{value:.1f}" for value in place - 45.0 * normal)
     roll, pitch = math.degrees(math.asin(-float(normal[1]))), math.degrees(math.atan2(normal[0], normal[2]))
     steep = abs(normal[2]) < 0.9  # then the heading lies in the xy-plane, across the normal
     heading = math.degrees(math.atan2(normal[0], -normal[1])) if steep else 0.0

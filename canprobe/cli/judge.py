@@ -24,7 +24,7 @@ from canprobe.cli.emulate import eds_files
 from canprobe.cli.interrupts import first_ctrl_c, left_by_ctrl_c
 from canprobe.cli.output import print_answer, print_json, print_table, say
 from canprobe.cli.parser import Parser
-from canprobe.cli.reports import add_report_options, command_line, eds_and_hash, read_baseline, versions, write_report
+from canprobe.cli.reports import add_report_options, bench_facts, eds_and_hash, read_baseline, write_report
 from canprobe.cli.target import loaded, one_channel, real_target, scene_target
 from canprobe.errors import UsageError
 from canprobe.fieldbus.eds.packaged import load_eds
@@ -166,10 +166,11 @@ def _judge_served(args: argparse.Namespace) -> int:
     _print(args, report)
     if report.exit_status:
         return report.exit_status
-    if not any(frame.from_node is False for frame in bench.frames):
+    heard = any(frame.from_node is False for frame in bench.frames)
+    if not heard:
         say(f"judge: no master was heard on {target.channel}: does it use this channel and bit rate?")
-        return max(3, _TIMED_OUT if bench.timed_out else _status_of_command(bench))
-    return _TIMED_OUT if bench.timed_out else _status_of_command(bench)
+    status = _TIMED_OUT if bench.timed_out else _status_of_command(bench)
+    return status if heard else max(3, status)
 
 
 def _server(args: argparse.Namespace, bench: MasterBench, nodes: Nodes) -> tuple[Target, Callable[[], None]]:
@@ -227,11 +228,7 @@ def _report_of(
 ) -> reports.Report:
     from canprobe.fieldbus.tools.judge.bench import first_answers
 
-    facts = {
-        **_facts(args),
-        "adapter": f"{target.interface} {target.channel}",
-        "frames": str(judge.frame_count),
-    }
+    facts = {**_facts(args), "adapter": f"{target.interface} {target.channel}", "frames": str(judge.frame_count)}
     if bench.command is not None:
         status = "ended by us" if bench.status is None else f"status {bench.status}"
         facts["master"] = f"{shlex.join(bench.command.words)}: {status}"
@@ -256,11 +253,7 @@ def _report_of(
 
 def _facts(args: argparse.Namespace) -> dict[str, str]:
     """What the report says of the bench."""
-    facts = {
-        "command": command_line(),
-        "bit rate": f"{args.bitrate or 1_000_000} bit/s",
-        "versions": versions(),
-    }
+    facts = bench_facts({"bit rate": f"{args.bitrate or 1_000_000} bit/s"})
     for name, one in zip(args.eds, args.node_id, strict=False):
         facts[f"EDS of node {one}"] = eds_and_hash(name)
     return facts
@@ -274,23 +267,17 @@ def _print(args: argparse.Namespace, report: reports.Report) -> None:
         return
     for row in report.rows:
         if row.verdict is reports.Verdict.FAIL:
-            print(reports.row_text(row))
-            _print_finding(row)
+            more = [
+                *(f"{key}: {getattr(row, key)}" for key in ("severity", "expected", "hint")),
+                *row.came[:_SHOWN_FRAMES],
+            ]
+            print(reports.row_text(row), *(f"       {line}" for line in more), sep="\n")
         elif args.report.verbosity > 0:
             print(reports.row_text(row))
     for name, fact in report.facts.items():
         if name.startswith("fault "):
             print(f"{name}: {fact}")
     print(reports.closing_text(report, change))
-
-
-def _print_finding(row: reports.ReportRow) -> None:
-    """The lines of a finding below its first."""
-    print(f"       severity: {row.severity}")
-    print(f"       expected: {row.expected}")
-    print(f"       hint: {row.hint}")
-    for frame in row.came[:_SHOWN_FRAMES]:
-        print(f"       {frame}")
 
 
 def _list(args: argparse.Namespace) -> int:

@@ -165,7 +165,11 @@ class Parser(argparse.ArgumentParser):
                 case "BUS":
                     self.add_shared("--bus", "--channel", "--bitrate", to=to)
                 case "-v":
-                    self._add_verbosity()
+                    either = self.add_mutually_exclusive_group()
+                    kind: dict[str, Any] = {"dest": "verbosity", "action": "store_const"}
+                    what = "report every step on stderr, even without a terminal"
+                    either.add_argument("-v", "--verbose", **kind, const=1, default=0, help=what)
+                    either.add_argument("-q", "--quiet", **kind, const=-1, help="report only warnings and errors")
                 case _:
                     self.add_option(*_OPTIONS[name], to=to)
 
@@ -193,14 +197,6 @@ class Parser(argparse.ArgumentParser):
         """Add --inject; `what` begins its help."""
         what += "; may be repeated; `canprobe inject --list` lists them"
         self.add_option("--inject FAULT", what, word, many=True)
-
-    def _add_verbosity(self) -> None:
-        """Add -v and -q to a command that reports its steps."""
-        either = self.add_mutually_exclusive_group()
-        kind: dict[str, Any] = {"dest": "verbosity", "action": "store_const"}
-        what = "report every step on stderr, even without a terminal"
-        either.add_argument("-v", "--verbose", **kind, const=1, default=0, help=what)
-        either.add_argument("-q", "--quiet", **kind, const=-1, help="report only warnings and errors")
 
     def error(self, message: str) -> NoReturn:
         """Report the error in one line and exit with status 2."""

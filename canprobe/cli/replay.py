@@ -35,28 +35,20 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Replay the log and print the estimates."""
-    from canprobe.cell.recorded import reestimate as recorded
-
-    if args.bridge:
-        return _run_into(args)
-    result = recorded.replay(args.log, scene=args.scene, method=args.method)
-    if args.out is not None:
-        result.save(args.out)
-    print_answer(args, result.summary, result.text())
-
-
-def _run_into(args: argparse.Namespace) -> None:
-    """Feed the log to bridges; print the estimates and the state of the bridges."""
-    from canprobe.cell.recorded.reestimate import replay_into
+    """Replay the log, to bridges too where some are named; print the estimates and the state of the bridges."""
+    from canprobe.cell.recorded.reestimate import RecordedBridges, replay, replay_into
     from canprobe.cell.results.text import bridge_lines
 
-    replayed = replay_into(args.log, args.bridge, scene=args.scene, method=args.method, say=args.report.say)
-    if replayed.result is not None and args.out is not None:
-        replayed.result.save(args.out)
-    summary, texts = ({}, []) if replayed.result is None else (replayed.result.summary, [replayed.result.text()])
-    text = "\n".join([*texts, *bridge_lines(replayed.bridges)])
-    print_answer(args, {**summary, "bridges": replayed.bridges}, text)
-    for name, status in replayed.bridges.items():
+    if args.bridge:
+        replayed = replay_into(args.log, args.bridge, scene=args.scene, method=args.method, say=args.report.say)
+    else:
+        replayed = RecordedBridges(replay(args.log, scene=args.scene, method=args.method), {})
+    result, bridges = replayed.result, replayed.bridges
+    if result is not None and args.out is not None:
+        result.save(args.out)
+    summary, texts = ({}, []) if result is None else (result.summary, [result.text()])
+    document = {**summary, "bridges": bridges} if args.bridge else summary
+    print_answer(args, document, "\n".join([*texts, *bridge_lines(bridges)]))
+    for name, status in bridges.items():
         if status["error"] is not None:
             raise ResultsError(f"bridge {name}: {status['error']}")

@@ -6,6 +6,7 @@ import argparse
 import os
 import shlex
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from canprobe.cli.parser import Parser
@@ -51,18 +52,14 @@ def write_report(
     return change
 
 
-def command_line() -> str:
-    """The command as it was typed."""
-    return shlex.join(["canprobe", *sys.argv[1:]])
-
-
-def versions() -> str:
-    """Versions of canprobe, Python and the system."""
+def bench_facts(bus: Mapping[str, str]) -> dict[str, str]:
+    """Facts of the bench: the command as it was typed, those of the bus, and versions."""
     import platform
 
     import canprobe
 
-    return f"canprobe {canprobe.__version__}, Python {platform.python_version()}, {platform.platform()}"
+    versions = f"canprobe {canprobe.__version__}, Python {platform.python_version()}, {platform.platform()}"
+    return {"command": shlex.join(["canprobe", *sys.argv[1:]]), **bus, "versions": versions}
 
 
 def eds_and_hash(name: str) -> str:

@@ -43,10 +43,9 @@ def add_arguments(parser: Parser) -> None:
         default=None,
         help="draw no report.png and surface.png [the scene's outputs.figures]",
     )
-    parser.add_argument(
-        "--only",
-        metavar="LIST",
-        help="outputs to make, of log,truth,surface_map,bus_log,figures; the others are off [the scene's outputs]",
+    parser.add_option(
+        "--only LIST",
+        "outputs to make, of log,truth,surface_map,bus_log,figures; the others are off [the scene's outputs]",
     )
     parser.add_option("--full", "print the error of the force and every estimator too")
     parser.add_shared("--json", "-v")

@@ -81,22 +81,14 @@ def run(args: argparse.Namespace) -> None:
     from canprobe import api
 
     target = real_target(args, args.channel, channel_else="can0")
-    if args.motors:
-        found = api.scan(target, timeout_s=args.timeout, motors=True, say=args.report.say)
-        print_answer(args, found, lambda: _print_motors(found, target.channel))
-        return
     if not args.lss:
-        nodes = api.scan(target, timeout_s=args.timeout, say=args.report.say)
-        print_answer(args, nodes, lambda: _print_nodes(nodes, target.channel))
+        found = api.scan(target, timeout_s=args.timeout, motors=args.motors, say=args.report.say)
+        show = _print_motors if args.motors else _print_nodes
+        print_answer(args, found, lambda: show(found, target.channel))
         return
     scene = None if args.scene is None else loaded(args)
     done = api.commission(
-        target,
-        scene=scene,
-        assign=args.assign,
-        store=not args.no_store,
-        timeout_s=args.timeout,
-        say=args.report.say,
+        target, scene=scene, assign=args.assign, store=not args.no_store, timeout_s=args.timeout, say=args.report.say
     )
     print_answer(args, done.as_document(), lambda: _print_commissioned(done, target.channel))
 

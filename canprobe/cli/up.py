@@ -47,14 +47,13 @@ def run(args: argparse.Namespace) -> None:
         raise UsageError("up: --check-joints feeds no --bridge")
     if args.recover and args.check_joints:
         raise UsageError("up: --check-joints moves joints with somebody beside it; leave out --recover")
-    scene = scene_of(args)
-    if args.check_joints:
-        need_terminal(args.yes, "up --check-joints asks before each motion")
 
     from canprobe import api
     from canprobe.cli.operator import LetterKey, TerminalOperator
 
+    scene = scene_of(args)
     if args.check_joints:
+        need_terminal(args.yes, "up --check-joints asks before each motion")
         api.check_joints(scene, operator=None if args.yes else TerminalOperator(), say=args.report.say)
         return
     with left_by_ctrl_c():

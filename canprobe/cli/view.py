@@ -45,12 +45,13 @@ def add_arguments(parser: Parser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Show it until Ctrl-C, or write the file."""
     from canprobe.cell.planning.bridges import check_view
+    from canprobe.cell.scene.load import packaged_files
 
     check_view()
     folder, browser = Path(args.what), _Browser(args.port, args.report.say, quiet=args.no_open)
     leave = left_by_ctrl_c() if args.html is None else contextlib.nullcontext()  # the normal end of a page only
     with leave:
-        if _is_scene(args.what):
+        if not folder.is_dir() or args.what in packaged_files("scenes"):  # `./cylinder` is a folder of that name
             folder = _run_scene(args, browser)
         from canprobe.lab.bridge.view.page import write_page
         from canprobe.lab.bridge.view.recorded import read_run
@@ -70,13 +71,6 @@ def run(args: argparse.Namespace) -> None:
                 say=args.report.say,
                 whole=interrupts_held,
             )
-
-
-def _is_scene(what: str) -> bool:
-    """Whether it names a packaged scene, which goes before a folder of that name; `./cylinder` is the folder."""
-    from canprobe.cell.scene.load import packaged_files
-
-    return not Path(what).is_dir() or what in packaged_files("scenes")
 
 
 def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:

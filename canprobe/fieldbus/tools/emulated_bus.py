@@ -9,14 +9,14 @@ from __future__ import annotations
 import struct
 import threading
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from contextlib import ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack, closing
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Self, TypeVar
+from typing import TypeVar
 
 import canopen
 
@@ -51,7 +51,7 @@ def _answer(future: Future[T], act: Callable[[], T]) -> None:
         future.set_exception(error)
 
 
-class EmulatedBus(ABC):
+class EmulatedBus(AbstractContextManager["EmulatedBus"]):
     """The bus of a test. A context manager; leaving it closes everything on it.
 
     Args:
@@ -146,9 +146,6 @@ class EmulatedBus(ABC):
     def _act(self, node_id: int, act: Callable[[], T]) -> T:
         """Do something to a node, or to the log (0), between two frames."""
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._stack.close()
 
@@ -229,9 +226,7 @@ class VirtualTimeBus(EmulatedBus):
         return PortNetwork(self.port())
 
     def port(self) -> Port:
-        port = self._bus.port()
-        self._stack.callback(port.close)
-        return port
+        return self._stack.enter_context(closing(self._bus.port()))
 
     def _attach(self, nodes: Sequence[FaultyNode]) -> None:
         for node in nodes:

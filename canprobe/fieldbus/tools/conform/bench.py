@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import NoReturn
 
@@ -70,26 +71,23 @@ class Bench(SdoClient):
 
     def takes(self, index: int, subindex: int, value: int) -> bool:
         """Whether the device takes a number."""
-        try:
+        with contextlib.suppress(SdoRefused):
             self.download(index, subindex, self.packed(index, subindex, value))
-        except SdoRefused:
-            return False
-        return True
+            return True
+        return False
 
     def packed(self, index: int, subindex: int, value: int, size: int = 0) -> bytes:
         """A number in the size of an entry that the device has."""
         size = size or len(self.device.values.get((index, subindex), b""))
-        if not size:
-            raise PointNotApplicable(f"the device has no {place_text(index, subindex)}")
+        self.require(size, f"the device has no {place_text(index, subindex)}")
         return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
 
     def need(self, *places: tuple[int, int], written: bool = True) -> None:
         """Check that the device has entries, and lets them be written. Raises PointNotApplicable."""
         for place in places:
-            if not self.device.has(*place):
-                raise PointNotApplicable(f"the device has no {place_text(*place)}")
-            if written and not self.device.writable(*place):
-                raise PointNotApplicable(f"{place_text(*place)} cannot be written, says the EDS")
+            self.require(self.device.has(*place), f"the device has no {place_text(*place)}")
+            writable = not written or self.device.writable(*place)
+            self.require(writable, f"{place_text(*place)} cannot be written, says the EDS")
 
     def serves(self, what: str) -> None:
         """Check that a read of 1000h is answered as ever. Raises Deviation."""
@@ -116,8 +114,7 @@ class Bench(SdoClient):
 
     def nmt(self, command: int) -> int:
         """Send an NMT command to the device; return when. Raises PointNotApplicable where it cannot be followed."""
-        if command == NmtCommand.START and self.kept_out:
-            raise PointNotApplicable(f"it needs operational: {self.kept_out}")
+        self.require(command != NmtCommand.START or not self.kept_out, f"it needs operational: {self.kept_out}")
         self._changed_ns = self.send(NMT_ID, bytes((command, self.node_id)))
         return self._changed_ns
 

@@ -12,9 +12,8 @@ from canprobe.fieldbus.protocol.cia402 import STATUSWORD
 from canprobe.fieldbus.protocol.frames import INVALID_FLAG
 from canprobe.fieldbus.protocol.pdo import RPDOS, TO_MAPPING, TPDOS, is_mapping
 from canprobe.fieldbus.protocol.sdo import Place
-from canprobe.fieldbus.tools.conform.outcome import Deviation
 from canprobe.fieldbus.tools.conform.permits import WriteList
-from canprobe.fieldbus.tools.conform.sdo_client import SdoClient, SdoRefused
+from canprobe.fieldbus.tools.conform.sdo_client import SdoClient
 from canprobe.fieldbus.tools.reports.report import IDENTITY
 
 DRIVE_PROFILE = 402
@@ -37,14 +36,12 @@ class ExaminedDevice:
         node_id: its id.
         description: statements of its EDS; None without one.
         values: bytes of the entries that it gave, by entry.
-        refused: abort codes of the entries that it refused.
         statuswords: indices of the statuswords of all axes, where it is a CiA 402 drive.
     """
 
     node_id: int
     description: Description | None = None
     values: dict[Place, bytes] = field(default_factory=dict)
-    refused: dict[Place, int] = field(default_factory=dict)
     statuswords: list[int] = field(default_factory=list)
 
     def read_all(self, bench: SdoClient, written: WriteList) -> None:
@@ -81,20 +78,12 @@ class ExaminedDevice:
             self._read(bench, (index, subindex))
 
     def _read(self, bench: SdoClient, place: Place) -> bytes | None:
-        if place in self.values:
-            return self.values[place]
-        try:
-            value = self.values[place] = bench.upload(*place)
-        except SdoRefused as refused:
-            self.refused[place] = refused.code
-            return None
-        except Deviation:
-            return None
-        entry = self.described(*place)
-        size = 0 if entry is None else -(-entry.bits // 8)
-        if size and len(value) > size and not any(value[size:]):  # an answer without a size has four bytes
-            self.values[place] = value[:size]
-        return self.values[place]
+        if place not in self.values and (value := bench.present(place)) is not None:
+            entry = self.described(*place)
+            size = 0 if entry is None else -(-entry.bits // 8)
+            padded = size and len(value) > size and not any(value[size:])  # an answer without a size has four bytes
+            self.values[place] = value[:size] if padded else value
+        return self.values.get(place)
 
     def has(self, index: int, subindex: int = 0) -> bool:
         """Whether the device gave this entry."""

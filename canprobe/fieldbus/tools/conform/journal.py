@@ -119,7 +119,11 @@ class Journal:
             raise BenchFailure(f"not restored: {', '.join(place_text(*place) for place in wrong)}")
         written = sorted(self.touched | set(differing))
         self.touched.clear()
-        return [self._line(place) for place in written]
+        return [
+            f"{place_text(*place)}: "
+            + (f"restored to {self.values[place].hex(' ')}" if place in self.values else "written, nothing to put back")
+            for place in written
+        ]
 
     def _restore_pdo(self, bench: SdoClient, index: int) -> None:
         cob_id = int.from_bytes(self.values.get((index, 1), b""), "little")
@@ -140,12 +144,6 @@ class Journal:
         if place in self.values and value and bench.present(place) != value:
             with contextlib.suppress(SdoRefused, Deviation):
                 bench.download(*place, value)
-
-    def _line(self, place: Place) -> str:
-        before = self.values.get(place)
-        return f"{place_text(*place)}: " + (
-            f"restored to {before.hex(' ')}" if before is not None else "written, nothing to put back"
-        )
 
 
 def _entries(values: Mapping[Place, bytes], index: int) -> list[Place]:

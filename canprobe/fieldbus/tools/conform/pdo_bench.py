@@ -117,11 +117,13 @@ class PdoBench(Bench):
             self.does_not_apply("no RPDO takes a dummy entry, so none can be sent without changing something")
         return pdo, self._harmless(pdo, EVENT_TYPE), (word & 0xFF) // 8
 
-    def rpdo_of(self, entry: DescribedEntry, kind: int) -> int:
-        """An RPDO that carries one entry that the user lets be written; return its identifier."""
+    def rpdo_of(self, entry: DescribedEntry, kind: int) -> tuple[int, int]:
+        """An RPDO of the started device with one entry that the user lets be written; its identifier, and the value."""
         pdo = self.idle_pdo(RPDOS, mapping=True)
         self.map_entries(pdo, [word_of(entry)])
-        return self._harmless(pdo, kind)
+        cob_id = self._harmless(pdo, kind)
+        self.start()
+        return cob_id, self.number(*entry.place)
 
     def _harmless(self, pdo: int, kind: int) -> int:
         cob_id = self.put_to_work(pdo, kind)

@@ -15,6 +15,7 @@ import re
 import socket
 import struct
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +44,8 @@ def _names(channel: str) -> list[str]:
     """Names of the sockets of a channel."""
     if not _SOCKETS.exists():
         raise InterfaceError("faults reach another process by a socket of Linux only; here give them to it: --inject")
-    start = f"@{_name(channel)}"
-    fields = (line.split() for line in _SOCKETS.read_text(encoding="ascii", errors="replace").splitlines())
-    found = {words[-1][1:] for words in fields if words and re.fullmatch(f"{re.escape(start)}[0-9]+", words[-1])}
-    return sorted(found)
+    listed = _SOCKETS.read_text(encoding="ascii", errors="replace")
+    return sorted(set(re.findall(rf"\s@({re.escape(_name(channel))}[0-9]+)\s*$", listed, re.MULTILINE)))
 
 
 def _user(line: socket.socket) -> int:
@@ -55,7 +54,7 @@ def _user(line: socket.socket) -> int:
     return int(_CREDENTIALS.unpack(credentials)[1])
 
 
-class ControlServer:
+class ControlServer(AbstractContextManager["ControlServer"]):
     """Takes faults for the nodes of this process. A context manager.
 
     Args:
@@ -74,9 +73,6 @@ class ControlServer:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         self._socket.bind(f"\0{_name(channel)}{os.getpid()}")
         self._socket.listen(_MAX_WAITING)
-
-    def __enter__(self) -> ControlServer:
-        return self
 
     def __exit__(self, *_: object) -> None:
         for line in [self._socket, *self._lines]:

@@ -43,7 +43,10 @@ class FaultyNodes:
         from canprobe.fieldbus.tools.faults.motor_faults import MOTOR_FAULTS, FaultyMotor
 
         fault = parse_fault(text, {**MOTOR_FAULTS, **self.kinds})
-        node = self._node(fault.node_id, text)
+        node = next((one for one in self.nodes if one.node_id == fault.node_id), None)
+        if node is None:
+            there = ", ".join(str(one.node_id) for one in self.nodes) or "none"
+            raise UsageError(f"fault {text!r}: no node {fault.node_id} is emulated here; nodes: {there}")
         kind, is_motor = fault.kind, isinstance(node, FaultyMotor)
         if kind.name not in MOTOR_FAULTS if is_motor else kind.needs == "motor":
             of_motors = ", ".join(MOTOR_FAULTS)
@@ -59,8 +62,7 @@ class FaultyNodes:
     def end(self, fault: Fault) -> None:
         """End a fault at the next frame or deadline of its node."""
         for node in self.nodes:
-            if node.node_id == fault.node_id:
-                node.remove(fault)
+            node.remove(fault)
 
     def clear(self) -> list[Fault]:
         """End all faults; return them."""
@@ -83,13 +85,6 @@ class FaultyNodes:
         """
         spans = sorted((span for node in self.nodes for span in node.spans), key=attrgetter("begin_ns"))
         return [FaultSpan(one.fault, one.begin_ns - start_ns, min(one.end_ns, now_ns) - start_ns) for one in spans]
-
-    def _node(self, node_id: int, text: str) -> FaultyNode:
-        for node in self.nodes:
-            if node.node_id == node_id:
-                return node
-        there = ", ".join(str(node.node_id) for node in self.nodes) or "none"
-        raise UsageError(f"fault {text!r}: no node {node_id} is emulated here; nodes: {there}")
 
 
 @contextmanager

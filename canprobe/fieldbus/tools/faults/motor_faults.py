@@ -11,7 +11,7 @@ from canprobe.fieldbus.motor.damiao import DamiaoMotor
 from canprobe.fieldbus.motor.protocol import MotorStatus, Rid
 from canprobe.fieldbus.node.slave_node import SlaveNode
 from canprobe.fieldbus.protocol.frames import Frame
-from canprobe.fieldbus.tools.faults.fault import Effect, FaultKind
+from canprobe.fieldbus.tools.faults.fault import Effect, Fault, FaultKind, Host
 from canprobe.fieldbus.tools.faults.faulty_node import FaultyNode
 from canprobe.fieldbus.tools.faults.registry import BUS_FAULTS, kinds_of
 
@@ -33,75 +33,78 @@ class FaultyMotor(FaultyNode):
         return frozenset({"enabled"} if self.motor.status is MotorStatus.ENABLED else ())
 
 
-class BrownOut(Effect):
+class MotorEffect(Effect):
+    """Base class of the faults of a motor."""
+
+    needs = "motor"
+
+    def __init__(self, fault: Fault, host: Host) -> None:
+        super().__init__(fault, host)
+        self.motor = cast(DamiaoMotor, self.node)
+
+
+class BrownOut(MotorEffect):
     """The supply sags: the motor starts anew, disabled, without what was not stored. It says nothing of it."""
 
     name = "brown-out"
-    needs = "motor"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
         self.node.advance(t_ns)  # up to here the last command moves it
         return self.node.start(t_ns)
 
 
-class OverTemperature(Effect):
+class OverTemperature(MotorEffect):
     """A limit of the motor is exceeded: it trips after the delay of that limit, and again after each FBh."""
 
     name = "over-temperature"
-    needs = "motor"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
-        self._motor = cast(DamiaoMotor, self.node)
-        self._motor.heat = (30, int(self.fault.value("deg_c")))
-        self._motor.exceeded_ns[MotorStatus(int(self.fault.value("status")))] = t_ns
+        self.motor.heat = (30, int(self.fault.value("deg_c")))
+        self.motor.exceeded_ns[MotorStatus(int(self.fault.value("status")))] = t_ns
         return ()
 
     def end(self, t_ns: int) -> None:
-        self._motor.heat = (30, 30)
-        self._motor.exceeded_ns.pop(MotorStatus(int(self.fault.value("status"))), None)
+        self.motor.heat = (30, 30)
+        self.motor.exceeded_ns.pop(MotorStatus(int(self.fault.value("status"))), None)
 
 
-class WatchdogTrip(Effect):
+class WatchdogTrip(MotorEffect):
     """The watchdog of an enabled motor trips although frames come."""
 
     name = "watchdog-trip"
-    needs = "motor"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
         out = self.node.advance(t_ns)
-        if (motor := cast(DamiaoMotor, self.node)).status is MotorStatus.ENABLED:
-            motor.turn(MotorStatus.COMMUNICATION_LOST)
+        if self.motor.status is MotorStatus.ENABLED:
+            self.motor.turn(MotorStatus.COMMUNICATION_LOST)
         return out
 
 
-class WrongRange(Effect):
+class WrongRange(MotorEffect):
     """Registers 21 to 23 are those of another type; they are put back at the end, unless somebody wrote them."""
 
     name = "wrong-range"
-    needs = "motor"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
         out = self.node.advance(t_ns)
-        self._registers = cast(DamiaoMotor, self.node).registers
-        self._found = {int(rid): self._registers[rid] for rid in (Rid.PMAX, Rid.VMAX, Rid.TMAX)}
+        self._found = {int(rid): self.motor.registers[rid] for rid in (Rid.PMAX, Rid.VMAX, Rid.TMAX)}
         self._wrong = {rid: value * self.fault.value("ratio") for rid, value in self._found.items()}
-        self._registers |= self._wrong
+        self.motor.registers |= self._wrong
         return out
 
     def end(self, t_ns: int) -> None:
-        if self._wrong.items() <= self._registers.items():
-            self._registers |= self._found
+        if self._wrong.items() <= self.motor.registers.items():
+            self.motor.registers |= self._found
 
 
-class EncoderWrap(Effect):
+class EncoderWrap(MotorEffect):
     """The position is off by whole turns from here on, as where their count was lost."""
 
     name = "encoder-wrap"
-    needs = "motor"
 
     def begin(self, t_ns: int) -> Sequence[Frame]:
         out = self.node.advance(t_ns)
-        cast(DamiaoMotor, self.node).joint.q += math.tau * self.fault.value("turns")
+        self.motor.joint.q += math.tau * self.fault.value("turns")
         return out
 
 

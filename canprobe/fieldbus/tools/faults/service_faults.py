@@ -132,7 +132,7 @@ class Remapped(Effect):
             if dictionary.number(index) >= 2:
                 first, second = dictionary.number(index, 1), dictionary.number(index, 2)
                 self._exchanged = index, first, second
-                self._put(second, first, t_ns)
+                self._put(index, second, first, t_ns)
                 return ()
         return None
 
@@ -140,10 +140,9 @@ class Remapped(Effect):
         if self._exchanged is not None:
             index, first, second = self._exchanged
             if [self.node.dictionary.number(index, sub) for sub in (1, 2)] == [second, first]:
-                self._put(first, second, t_ns)
+                self._put(index, first, second, t_ns)
 
-    def _put(self, first: int, second: int, t_ns: int) -> None:
-        assert self._exchanged is not None
+    def _put(self, index: int, first: int, second: int, t_ns: int) -> None:
         for sub, entry in ((1, first), (2, second)):
-            self.node.dictionary.put(self._exchanged[0], sub, entry)
+            self.node.dictionary.put(index, sub, entry)
         self.node.pdos.reset(t_ns)

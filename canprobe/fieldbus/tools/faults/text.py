@@ -9,6 +9,8 @@ seed, or direction (in, out). Numbers may be hexadecimal, such as 0x1017.
 
 from __future__ import annotations
 
+import contextlib
+import math
 import re
 from collections.abc import Mapping
 
@@ -91,13 +93,10 @@ def _number(text: str, name: str, value: str, known: Mapping[str, Parameter]) ->
             f"fault {text!r}: unknown parameter {name!r}{did_you_mean(name, known, 0.6)};"
             f" it takes {', '.join([*known, 'direction'])}"
         )
-    try:
-        number: float = int(value, 0)
-    except ValueError:
-        try:
-            number = float(value)
-        except ValueError:
-            number = float("nan")
+    number = math.nan
+    for parse in (float, lambda word: int(word, 0)):
+        with contextlib.suppress(ValueError):
+            number = parse(value)
     if not parameter.low <= number <= parameter.high:
         raise UsageError(
             f"fault {text!r}: {name}: expected {parameter.what}, {parameter.low:g} to {parameter.high:g}, got {value!r}"

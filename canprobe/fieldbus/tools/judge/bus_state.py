@@ -35,7 +35,7 @@ class BusState:
         now_ns: time of the last frame.
         syncs_ns: times of the last SYNCs.
         sync_count: number of SYNCs so far.
-        others_ns: time of the last heartbeat of each id that is no node here.
+        others: ids that are no node here, and send heartbeats.
         arbitration_ns: time for which a frame may have to wait for another.
     """
 
@@ -53,7 +53,7 @@ class BusState:
         self.now_ns = 0
         self.syncs_ns: deque[int] = deque(maxlen=34)
         self.sync_count = 0
-        self.others_ns: dict[int, int] = {}
+        self.others: set[int] = set()
         self.arbitration_ns = _ARBITRATION_BITS * 1_000_000_000 // bitrate
 
     @property
@@ -103,7 +103,7 @@ class BusState:
             for event in self._channels[node.node_id].from_client(frame):
                 if isinstance(event, events.RequestSeen):
                     node.asked = True
-                    node.touch(event.place[0])
+                    node.touched.add(event.place[0])
                 yield event
             return
         yield from self._sent_by(node, frame)
@@ -152,7 +152,7 @@ class BusState:
         node = self.nodes.get(node_id)
         if node is None:
             yield events.OtherHeartbeatSeen(frame, node_id)
-            self.others_ns[node_id] = frame.t_ns
+            self.others.add(node_id)
             return
         yield from self._sent_by(node, frame)
         state = frame.data[0] & 0x7F if len(frame.data) == 1 else -1
@@ -180,10 +180,8 @@ class BusState:
         if not isinstance(event, events.AnswerSeen) or event.late:
             return
         node = event.node
-        if event.writes and event.place[0] == _STORE:
-            node.stored = True
-        if event.writes:
-            node.configured = True
+        node.configured = node.configured or event.writes
+        node.stored = node.stored or (event.writes and event.place[0] == _STORE)
         if event.value is None:
             return
         shown = event.request if event.writes else event.frame
@@ -201,7 +199,7 @@ class BusState:
             known = before[place]
             value, old = values[place], known.value if known is not None else None
             if index == cia402.STATUSWORD and not written:
-                yield events.StatusSeen(frame, node, value, old)
+                yield events.StatusSeen(frame, node, value)
             elif not written:
                 continue
             elif index == cia402.CONTROLWORD:

@@ -135,7 +135,6 @@ class StatusSeen(NodeSeen):
     """A statusword."""
 
     word: int
-    before: int | None
 
 
 @dataclass(slots=True, eq=False)

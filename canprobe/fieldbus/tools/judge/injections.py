@@ -29,20 +29,18 @@ class Injections:
         nodes: the served nodes.
         faults: faults with their nodes, as `parse_fault` reads them; None for the standard sequence.
         now_ns: present time, from which `at` counts.
+
+    Attributes:
+        not_thrown: faults of the sequence that were not thrown yet.
     """
 
     def __init__(self, nodes: FaultyNodes, faults: Sequence[str] | None, now_ns: int) -> None:
         self._nodes = nodes
-        self._queue = list(STANDARD_FAULTS) if faults is None else []
+        self.not_thrown = list(STANDARD_FAULTS) if faults is None else []
         self._calm_ns: int | None = None
         self._now_ns = now_ns
         for text in faults or ():
             nodes.inject(text, now_ns)
-
-    @property
-    def not_thrown(self) -> list[str]:
-        """Faults of the sequence that were not thrown."""
-        return list(self._queue)
 
     def thrown(self, start_ns: int = 0) -> list[FaultSpan]:
         """Faults that held, in order, with times from a beginning; one that holds ends at the last look."""
@@ -51,7 +49,7 @@ class Injections:
     def look(self, now_ns: int) -> None:
         """Throw the next fault of the sequence when no other holds and the nodes are at work."""
         self._now_ns = now_ns
-        if not self._queue or any(node.holding for node in self._nodes.nodes):
+        if not self.not_thrown or any(node.holding for node in self._nodes.nodes):
             return
         at_work = _at_work(self._nodes.nodes)
         if at_work is None:
@@ -60,7 +58,7 @@ class Injections:
             self._calm_ns = now_ns
         elif now_ns - self._calm_ns >= _CALM_NS:
             with suppress(UsageError):  # the node is no drive, which this kind needs
-                self._nodes.inject(f"node {at_work.node_id}: {self._queue.pop(0)}", now_ns)
+                self._nodes.inject(f"node {at_work.node_id}: {self.not_thrown.pop(0)}", now_ns)
                 self._calm_ns = None
 
 

@@ -183,7 +183,7 @@ def no_watchdog(case: Case, node: SeenNode) -> Watch[events.StatusSeen]:
 
 def _is_watched(case: Case, node: SeenNode) -> bool:
     consumers = (node.value(0x1016, sub) or 0 for sub in range(1, 9))
-    heartbeat = any(word & 0xFFFF and (word >> 16 & 0x7F) in case.bus.others_ns for word in consumers)
+    heartbeat = any(word & 0xFFFF and (word >> 16 & 0x7F) in case.bus.others for word in consumers)
     timers = any(pdo.event_timer_ms and node.rpdo_counts[pdo.number] for pdo in node.rpdos.values())
     guarding = node.value(0x100C) and node.value(0x100D)
     return bool(heartbeat or timers or guarding or (node.value(0x1006) and case.bus.syncs_ns))

@@ -176,8 +176,7 @@ class _Losses:
         if len(times) < 3:
             return 0
         usual_ns = sorted(b - a for a, b in pairwise(times))[(len(times) - 1) // 2]
-        consumers = [node.number(0x1016, sub) or 0 for sub in range(1, 9)]
-        consumed_ms = max(word & 0xFFFF for word in consumers)
+        consumed_ms = max((node.number(0x1016, sub) or 0) & 0xFFFF for sub in range(1, 9))
         return max(3 * usual_ns, consumed_ms * 1_000_000) + 2 * self._bus.period_ns
 
     def _follow(self, event: events.TargetSeen | events.ControlSeen) -> None:

@@ -79,7 +79,10 @@ class SdoChannel:
             return
         command = data[0] >> 5
         if one is None:
-            yield from self._late(frame, command)
+            late = self._aborted  # a transfer that the client has given up
+            if late is not None and command in (2, 3) and sdo.place_of(data) == late.place:
+                self._aborted = None
+                yield AnswerSeen(frame, self._node, late.writes, late.place, None, late.request, late=True)
         elif data[0] == sdo.ABORT:
             self._open = None
             code = sdo.abort_code(data)
@@ -92,13 +95,6 @@ class SdoChannel:
         assert one is not None
         value = self._node.value_of(one.place, one.data)
         yield AnswerSeen(frame, self._node, one.writes, one.place, value, one.request)
-
-    def _late(self, frame: BusFrame, command: int) -> Iterator[BusEvent]:
-        """An answer to a transfer that the client has given up."""
-        one = self._aborted
-        if one is not None and command in (2, 3) and sdo.place_of(frame.data) == one.place:
-            self._aborted = None
-            yield AnswerSeen(frame, self._node, one.writes, one.place, None, one.request, late=True)
 
 
 def _ends(one: _Transfer, data: bytes, command: int) -> bool:

@@ -96,6 +96,7 @@ class SeenNode:
         syncs: number of SYNCs since then.
         heartbeats_ns: times of the last heartbeats.
         addressed: whether the master has sent anything to this node.
+        touched: indices of the objects that the master has read or written.
         configured: whether the master has written an object by SDO.
         rpdos, tpdos: valid PDOs by COB-ID.
         rpdo_counts: number of frames by number of the RPDO since the last boot-up.
@@ -111,7 +112,7 @@ class SeenNode:
         self.started_ns: int | None = None
         self.syncs = 0
         self.heartbeats_ns: deque[int] = deque(maxlen=8)
-        self._touched: set[int] = set()
+        self.touched: set[int] = set()
         self._known: dict[Place, Known] = {}
         self.rpdo_counts: Counter[int] = Counter()
         self.rpdos: dict[int, PdoView] = {}
@@ -151,9 +152,8 @@ class SeenNode:
 
     def value(self, index: int, subindex: int = 0) -> int | None:
         """The last value that passed, or else that of the EDS; None where neither has one."""
-        found = self._known.get((index, subindex))
-        if found is not None:
-            return found.value
+        if (passed := self.number(index, subindex)) is not None:
+            return passed
         entry = self._description.entry(index, subindex)
         return entry.initial if entry is not None and isinstance(entry.initial, int) else None
 
@@ -163,7 +163,7 @@ class SeenNode:
 
     def is_sure(self, index: int) -> bool:
         """Whether `value` is true of the device: it passed on the bus, the node has booted, or it is served here."""
-        return self._served or self.booted or index in self._touched
+        return self._served or self.booted or index in self.touched
 
     def take(self, place: Place, value: int, frame: BusFrame) -> None:
         """Take the value of an object, written or read. A mode that is asked for again keeps its first time."""
@@ -174,10 +174,6 @@ class SeenNode:
         if place[0] == cia402.POSITION:
             self.positions.append((frame.t_ns, value))
 
-    def touch(self, index: int) -> None:
-        """Note that the master has read or written an object."""
-        self._touched.add(index)
-
     def value_of(self, place: Place, data: bytes) -> int | None:
         """The number in the bytes of an object; None where it is none."""
         if not 0 < len(data) <= 8:
@@ -187,8 +183,7 @@ class SeenNode:
             return None
         if entry is not None and 0 < entry.bits < 8 * len(data):
             data = data[: (entry.bits + 7) // 8]
-        signed = entry.signed if entry is not None else place[0] in _SIGNED
-        return int.from_bytes(data, "little", signed=signed)
+        return int.from_bytes(data, "little", signed=self._is_signed(place))
 
     def read_pdos(self) -> None:
         """Read the PDOs anew from their parameters."""
@@ -204,19 +199,19 @@ class SeenNode:
             if cob_id is None or cob_id & INVALID_FLAG or not count or count > 64:
                 continue
             words = [self.value(index + TO_MAPPING, sub) or 0 for sub in range(1, count + 1)]
-            entries = tuple(PdoEntry.from_word(word, self._is_signed(word)) for word in words)
+            entries = tuple(PdoEntry.from_word(word, self._is_signed((word >> 16, word >> 8 & 0xFF))) for word in words)
             try:
                 layout = PdoLayout(cob_id & 0x7FF, entries, self.value(index, 2) or 0)
             except ProtocolError:
                 continue
-            touched = {index, index + TO_MAPPING} & self._touched
+            touched = {index, index + TO_MAPPING} & self.touched
             certain = self._served or len(touched) == 2
             found[layout.cob_id] = PdoView(number, layout, self.value(index, 5) or 0, certain, bool(touched))
         return found
 
-    def _is_signed(self, word: int) -> bool:
-        entry = self._description.entry(word >> 16, word >> 8 & 0xFF)
-        return entry.signed if entry is not None else word >> 16 in _SIGNED
+    def _is_signed(self, place: Place) -> bool:
+        entry = self._description.entry(*place)
+        return entry.signed if entry is not None else place[0] in _SIGNED
 
     @property
     def is_drive(self) -> bool:

@@ -103,9 +103,7 @@ class LinkVerdict:
         return {
             "verdict": str(self.fitness),
             "rate_hz": self.rate_hz,
-            "cause": self.cause or None,
-            "why": self.why or None,
-            "way_out": self.way_out or None,
+            **{name: getattr(self, name) or None for name in ("cause", "why", "way_out")},
             "fit_rate_hz": self.fit_rate_hz,
             "overruns_percent": {f"{rate:g}": 100.0 * share for rate, share in self.overruns.items()},
         }
@@ -121,7 +119,7 @@ def judge_link(figures: LinkFigures, limits: LinkLimits) -> LinkVerdict:
     rate_hz = 1e9 / figures.period_ns
     findings = [
         (answers := _answers(figures, limits, figures.wait_ns)),
-        (lateness := _lateness(figures, limits)),
+        (lateness := _lateness(figures, limits, figures.period_ns)),
         Fitness.UNFIT if figures.failure is not None or figures.passive or figures.array_silent else Fitness.FIT,
         Fitness.MARGINAL if figures.torn or figures.dropped else Fitness.FIT,
     ]
@@ -181,8 +179,7 @@ def _stands_still(figures: LinkFigures) -> bool:
     return abs(standstill_share(slow, figures.period_ns, IDLE_FAST_NS) - fast) < abs(single - fast)
 
 
-def _lateness(figures: LinkFigures, limits: LinkLimits, period_ns: int | None = None) -> Fitness:
-    period_ns = figures.period_ns if period_ns is None else period_ns
+def _lateness(figures: LinkFigures, limits: LinkLimits, period_ns: int) -> Fitness:
     share = predict_overruns(figures, 1e9 / period_ns)
     if share > min(UNFIT_SHARE, limits.late_share) or _gaps_expected(figures, limits, period_ns) > STOPS_EXPECTED:
         return Fitness.UNFIT

@@ -62,10 +62,9 @@ def verdict_text(report: Report, change: ReportChange | None = None) -> str:
 def closing_text(report: Report, change: ReportChange | None = None) -> str:
     """The closing table: a line for each group with its counts, their sum, and what changed since the baseline."""
     counts = {group: Counter(row.verdict for row in rows) for group, rows in report.groups().items()}
-    total: Counter[Verdict] = sum(counts.values(), Counter())
     cells = [["", *MARKS.values()]]
     cells += [[group, *(str(row[verdict] or "-") for verdict in MARKS)] for group, row in counts.items()]
-    cells.append(["in all", *(str(total[verdict]) for verdict in MARKS)])
+    cells.append(["in all", *map(str, report.counts().values())])
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     lines = [
         "  ".join([name.ljust(widths[0]), *(one.rjust(width) for one, width in zip(numbers, widths[1:], strict=True))])

@@ -113,14 +113,11 @@ def sync_identifier(bench: Bench) -> None:
 @point(87, "restricted identifiers", "CiA 301, restricted CAN-IDs", accepted.VALUE)
 def restricted_identifiers(bench: Bench) -> None:
     """1005h, 1012h and 1014h with restricted identifiers; one that is accepted is put back."""
-    found = False
-    for index in (0x1005, 0x1012, 0x1014):
-        if not bench.device.writable(index):
-            continue
-        found = True
+    indices = [index for index in (0x1005, 0x1012, 0x1014) if bench.device.writable(index)]
+    bench.require(indices, "none of 1005h, 1012h and 1014h can be written")
+    for index in indices:
         for cob_id in RESTRICTED_IDS:
             bench.must_refuse_write(index, 0, cob_id, accepted.VALUE, f"{cob_id:03X}h for {index:04X}h")
-    bench.require(found, "none of 1005h, 1012h and 1014h can be written")
 
 
 @point(90, "identity", "CiA 306-1, DeviceInfo; CiA 301, 1018h", "the numbers of the EDS", needs="eds")

@@ -120,9 +120,7 @@ def synchronous_rpdo(bench: PdoBench) -> None:
     """An entry that the user lets be written, by an RPDO of type 1."""
     entry = bench.permitted_entry(transmits=False)
     bench.plain_sync()
-    cob_id = bench.rpdo_of(entry, 1)
-    bench.start()
-    before = bench.number(*entry.place)
+    cob_id, before = bench.rpdo_of(entry, 1)
     _send_value(bench, cob_id, before ^ 1, entry.bits)
     bench.expect(bench.number(*entry.place) == before, "a synchronous RPDO is applied before SYNC")
     bench.sync_and_wait()
@@ -154,9 +152,7 @@ def short_rpdo_applied(bench: PdoBench) -> None:
     """An entry that the user lets be written keeps its value."""
     entry = bench.permitted_entry(transmits=False)
     bench.require(entry.bits >= 16, "the entry has one byte only")
-    cob_id = bench.rpdo_of(entry, EVENT_TYPE)
-    bench.start()
-    before = bench.number(*entry.place)
+    cob_id, before = bench.rpdo_of(entry, EVENT_TYPE)
     bench.asked.add(PDO_TOO_SHORT_CODE)
     bench.send(cob_id, bytes((before & 0xFF ^ 1,)))
     bench.pass_time(bench.times.slack_s)
@@ -168,11 +164,9 @@ def short_rpdo_applied(bench: PdoBench) -> None:
 def long_rpdo(bench: PdoBench) -> None:
     """An entry that the user lets be written, by an RPDO with a byte too many."""
     entry = bench.permitted_entry(transmits=False)
-    cob_id = bench.rpdo_of(entry, EVENT_TYPE)
-    bench.start()
     bench.require(entry.bits < 64, "the entry fills a whole frame")
+    cob_id, before = bench.rpdo_of(entry, EVENT_TYPE)
     bench.asked.add(PDO_TOO_LONG_CODE)
-    before = bench.number(*entry.place)
     _send_value(bench, cob_id, before ^ 1, entry.bits + 8)
     bench.expect(bench.number(*entry.place) == before ^ 1, "the first bytes of a long RPDO are not used")
     _send_value(bench, cob_id, before, entry.bits)
@@ -210,10 +204,9 @@ def synchronous_window(bench: PdoBench) -> None:
     entry = bench.permitted_entry(transmits=False)
     bench.need((0x1007, 0))
     bench.plain_sync()
-    cob_id = bench.rpdo_of(entry, 1)
     bench.put(0x1007, 0, _WINDOW_US)
-    bench.start()
-    before, seen = bench.number(*entry.place), []
+    cob_id, before = bench.rpdo_of(entry, 1)
+    seen = []
     for wait_s in (0.0, 1.5e-6 * _WINDOW_US):
         bench.sync()
         bench.pass_time(wait_s)
@@ -228,8 +221,7 @@ def synchronous_window(bench: PdoBench) -> None:
 @point(37, "SYNC start value", "18xxh:06", "the first TPDO at the SYNC with this counter", needs="nmt sync")
 def sync_start_value(bench: PdoBench) -> None:
     """Type 2 with start value 3, SYNC counters 1 to 8 with overflow 10."""
-    pdo = bench.changeable_pdo(TPDOS)
-    bench.need((0x1019, 0), (pdo, 6))
+    bench.need((0x1019, 0), (bench.changeable_pdo(TPDOS), 6))
     if bench.device.number(0x1006):
         bench.put(0x1006, 0, 0)
     bench.put(0x1019, 0, 10)

@@ -27,8 +27,7 @@ def _valid(bench: PdoBench, area: range, *, mapping: bool = False) -> int:
     """A PDO that can be changed, at work."""
     pdo = bench.changeable_pdo(area, mapping=mapping)
     if bench.device.cob_id(pdo) is None:
-        cob_id = bench.switch_on(pdo)
-        bench.permits.rpdo_ids.add(cob_id)
+        bench.permits.rpdo_ids.add(bench.switch_on(pdo))
     return pdo
 
 
@@ -128,13 +127,12 @@ def identifier_while_valid(bench: PdoBench) -> None:
 @point(28, "times while valid", "18xxh:03, :06", accepted.PDO_LOCKED, needs="nmt")
 def times_while_valid(bench: PdoBench) -> None:
     """Inhibit time and SYNC start value of a TPDO in use."""
-    pdo, tried = _valid(bench, TPDOS), 0
-    for subindex in (PdoSub.INHIBIT_TIME, PdoSub.SYNC_START):
-        if bench.device.writable(pdo, subindex):
-            tried += 1
-            value = bench.packed(pdo, subindex, bench.number(pdo, subindex) ^ _CHANGED_BIT)
-            bench.must_refuse_write(pdo, subindex, value, accepted.PDO_LOCKED, f"{pdo:04X}h:{subindex:02X}")
-    bench.require(tried, "the TPDOs have neither inhibit time nor start value")
+    pdo = _valid(bench, TPDOS)
+    times = [one for one in (PdoSub.INHIBIT_TIME, PdoSub.SYNC_START) if bench.device.writable(pdo, one)]
+    bench.require(times, "the TPDOs have neither inhibit time nor start value")
+    for subindex in times:
+        value = bench.packed(pdo, subindex, bench.number(pdo, subindex) ^ _CHANGED_BIT)
+        bench.must_refuse_write(pdo, subindex, value, accepted.PDO_LOCKED, f"{pdo:04X}h:{subindex:02X}")
 
 
 @point(28, "restricted identifiers", "restricted CAN-IDs", accepted.VALUE, needs="nmt")

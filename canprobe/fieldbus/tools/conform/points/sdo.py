@@ -89,12 +89,11 @@ def _limited(bench: Bench) -> Iterator[tuple[DescribedEntry, int, bool]]:
 @point(17, "limits", CODES, "above 06090031h, below 06090032h, or 06090030h", needs="eds")
 def limits(bench: Bench) -> None:
     """A value beyond each limit that the EDS states, for entries that may be written."""
-    found = False
-    for entry, value, above in _limited(bench):
-        found = True
+    limited = [*_limited(bench)]
+    bench.require(limited, "no entry that may be written has a limit; --write names more")
+    for entry, value, above in limited:
         codes, what = accepted.ABOVE if above else accepted.BELOW, f"{value} for {place_text(*entry.place)}"
         bench.must_refuse_write(*entry.place, bench.packed(*entry.place, value), codes, what)
-    bench.require(found, "no entry that may be written has a limit; --write names more")
 
 
 @point(75, "default channel", "1200h", "1200h:01 is 600h+id, 1200h:02 is 580h+id")

@@ -25,8 +25,8 @@ def _segmented_download(bench: Bench) -> None:
     """Begin a segmented download of two bytes to 1017h."""
     bench.need((_HEARTBEAT, 0))
     answer = bench.request(0x21, _HEARTBEAT, 0, b"\2\0\0\0")
-    if answer[0] != 0x60:
-        bench.deviates(f"a segmented download of 2 bytes to 1017h is answered with {answer.hex(' ')}")
+    what = "a segmented download of 2 bytes to 1017h"
+    bench.expect(answer[0] == 0x60, f"{what} is answered with {answer.hex(' ')}")
 
 
 def _segmented_upload(bench: Bench) -> None:
@@ -194,8 +194,7 @@ def block_upload(bench: Bench) -> None:
 @point(23, "acknowledgement of 128", BLOCKS, accepted.SEQUENCE)
 def acknowledgement_of_128(bench: Bench) -> None:
     """A block upload, of which more segments are acknowledged than a block can have."""
-    index = _text_index(bench)
-    _block_segments(bench, index)
+    _block_segments(bench, _text_index(bench))
     acknowledgement = bytes((0xA2, 128, 127)) + bytes(5)
     _must_end_transfer(bench, acknowledgement, accepted.SEQUENCE, "an acknowledgement of 128 segments")
 
