@@ -37,21 +37,21 @@ _DRIVERS = {
     "tactile": ("ros2_canopen::ProxyDriver", "canopen_proxy_driver"),
 }
 _NOT_SLAVES = ("options", "master", "defaults", "nodes")
-_DCFGEN_KEYS = frozenset({
+_SLAVE_KEYS = frozenset({
+    # of dcfgen
     "node_id", "dcf", "dcf_path", "revision_number", "serial_number", "heartbeat_multiplier", "heartbeat_consumer",
     "heartbeat_producer", "time_cob_id", "retry_factor", "guard_time", "life_time_factor", "error_behavior", "rpdo",
     "tpdo", "boot", "mandatory", "reset_communication", "software_file", "software_version", "configuration_file",
     "restore_configuration", "sdo",
-})  # fmt: skip
-_DRIVER_KEYS = frozenset({
+    # of the drivers
     "driver", "package", "namespace", "enable_lazy_load", "polling", "period", "diagnostics", "sdo_timeout_ms",
     "switching_state", "position_mode", "velocity_mode", "torque_mode", "scale_pos_to_dev", "scale_pos_from_dev",
     "scale_vel_to_dev", "scale_vel_from_dev", "scale_eff_to_dev", "scale_eff_from_dev", "offset_pos_to_dev",
     "offset_pos_from_dev", "homing_timeout_seconds", "num_channels", "joint_name", "vendor_id", "product_code",
     "boot_timeout", "boot_timeout_ms", "channels", "channel_names", "effort_mode", "non_transmit_timeout", "remappings",
+    "eds",  # where dcfgen has dcf
 })  # fmt: skip
 _EDS_KEYS = ("dcf", "eds")
-_SLAVE_KEYS = _DCFGEN_KEYS | _DRIVER_KEYS | frozenset(_EDS_KEYS)
 _OPTION_KEYS = frozenset(("dcf_path", "heartbeat_multiplier"))
 _FOLDER_VARIABLE = "@BUS_CONFIG_PATH@"
 _OWN_KEYS = (0x1016, 0x1017)  # dcfgen writes them from heartbeat_producer and heartbeat_consumer

@@ -112,15 +112,13 @@ class _Describer:
         messages = [self._sync(), *(self._pdos(pdos) for pdos in shared.values())]
         messages += [self._emergency(node_id) for node_id in plan.node_ids]
         messages += [self._heartbeat(node_id) for node_id in (*plan.node_ids, MASTER_NODE_ID)]
-        specifics = None
-        if any(message.is_fd for message in messages):
-            specifics = self._load(_FD_ATTRIBUTES, "dbc").dbc
+        has_fd = any(message.is_fd for message in messages)
         return can.Database(
             messages=sorted(messages, key=lambda message: message.frame_id),
             nodes=[can.Node(name) for name in self._names.values()],
             buses=[can.Bus(identifier(bus.channel), baudrate=plan.scene.bus.bitrate) for bus in plan.buses],
             version=plan.scene.name,
-            dbc_specifics=specifics,
+            dbc_specifics=self._load(_FD_ATTRIBUTES, "dbc").dbc if has_fd else None,
         )
 
     def _sync(self) -> Any:
@@ -137,16 +135,12 @@ class _Describer:
         first = pdos_by_node[0]
         signals = [signal for pdo in pdos for signal in self._pdo_signals(pdo, several=len(pdos) > 1)]
         owners = "_".join(self._names[pdo.node_id] for pdo in pdos_by_node)
-        return self._message(
-            first.cob_id,
-            f"{owners}_{first.direction.upper()}{first.number}",
-            first.layout.length,
-            first.node_id if first.direction == "tpdo" else MASTER_NODE_ID,
-            signals,
-            comment=f"transmission type {first.transmission_type}, {first.rate_hz:g} a second",
-            cycle_time=_whole_ms(1000 / first.rate_hz) if first.layout.synchronous else None,
-            bus_name=identifier(first.channel),
-        )
+        name = f"{owners}_{first.direction.upper()}{first.number}"
+        sender = first.node_id if first.direction == "tpdo" else MASTER_NODE_ID
+        comment = f"transmission type {first.transmission_type}, {first.rate_hz:g} a second"
+        period_ms = _whole_ms(1000 / first.rate_hz) if first.layout.synchronous else None
+        more = {"comment": comment, "cycle_time": period_ms, "bus_name": identifier(first.channel)}
+        return self._message(first.cob_id, name, first.layout.length, sender, signals, **more)
 
     def _pdo_signals(self, pdo: PlannedPdo, *, several: bool) -> Iterator[Any]:
         readers = [_MASTER if pdo.direction == "tpdo" else self._names[pdo.node_id]]

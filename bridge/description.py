@@ -6,6 +6,7 @@ the joint turns; `/tf_static` has it behind `link_i`. Any other arm is a drum al
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as Xml
@@ -111,14 +112,9 @@ def robot_description(plan: Plan) -> str | None:
         moving = _joint(robot, chain.joints[i - 1], kind, _link(i - 1), axis_frame(i))
         _origin(moving, chain.fixed[0] if i == 1 else np.eye(4))
         Xml.SubElement(moving, "axis", xyz="0 0 1")
-        Xml.SubElement(
-            moving,
-            "limit",
-            lower=f"{joint.q_min:.12g}",
-            upper=f"{joint.q_max:.12g}",
-            velocity=f"{joint.qd_max:.12g}",
-            effort=f"{joint.rated_torque or 0.0:.12g}",
-        )
+        limits = {"lower": joint.q_min, "upper": joint.q_max, "velocity": joint.qd_max}
+        limits["effort"] = joint.rated_torque or 0.0
+        Xml.SubElement(moving, "limit", {name: f"{value:.12g}" for name, value in limits.items()})
         Xml.SubElement(robot, "link", name=_link(i))
         _origin(_joint(robot, f"{axis_frame(i)}_to_{_link(i)}", "fixed", axis_frame(i), _link(i)), T)
     _fix(robot, FLANGE, _link(chain.n), np.eye(4))
@@ -126,9 +122,9 @@ def robot_description(plan: Plan) -> str | None:
         link = _fix(robot, PROBE, FLANGE, T_flange_probe(probe))
         _visual(link, np.eye(4), DARK, "sphere", radius=f"{probe.radius_mm * 1e-3:.12g}")
     assert plan.scene.arm is not None
-    if not _add_own_solids(plan.scene.arm, frames):
-        for solid in simple_solids(chain):
-            _visual(frames[solid.joint], solid.T, solid.colour or WHITE, solid.kind, **_sizes(solid))
+    shown = list(_own_solids(plan.scene.arm)) or [(solid, _sizes(solid)) for solid in simple_solids(chain)]
+    for solid, attributes in shown:
+        _visual(frames[solid.joint], solid.T, solid.colour or WHITE, solid.kind, **attributes)
     return Xml.tostring(robot, encoding="unicode")
 
 
@@ -150,22 +146,19 @@ def _fix(robot: Xml.Element, name: str, parent: str, T: Floats) -> Xml.Element:
     return link
 
 
-def _add_own_solids(arm: ArmSettings, frames: dict[int, Xml.Element]) -> bool:
-    """Add the solids of the arm's own URDF; False where it has none, or none is found."""
+def _own_solids(arm: ArmSettings) -> Iterator[tuple[Visual, dict[str, str]]]:
+    """Solids of the arm's own URDF that are found, each with its attributes in a URDF."""
     try:
         solids = urdf_solids(arm)
     except PlanError:
-        return False
-    shown = False
+        return
     for solid in solids:
         attributes = _sizes(solid)
         if solid.kind == "mesh":
             path = find_mesh(Path(arm.urdf or ""), solid.mesh)
             attributes = {} if path is None else {"filename": path.as_uri(), **attributes}
         if attributes:
-            _visual(frames[solid.joint], solid.T, solid.colour or WHITE, solid.kind, **attributes)
-            shown = True
-    return shown
+            yield solid, attributes
 
 
 def _sizes(solid: Visual) -> dict[str, str]:

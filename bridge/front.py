@@ -55,12 +55,8 @@ class Front:
         self.port = int(self._socket.getsockname()[1])
         self._origins = frozenset(origin.lower() for origin in (*origins, *own_origins))
         here = socket.gethostname().lower()
-        self._hosts = {
-            host.lower(),
-            here,
-            f"{here.partition('.')[0]}.local",
-            *map(_name, self._origins - {*own_origins}),
-        }
+        allowed = map(_name, self._origins - {*own_origins})
+        self._hosts = {host.lower(), here, f"{here.partition('.')[0]}.local", *allowed}
         self._loop = asyncio.new_event_loop()
         self._stop = asyncio.Event()
         self._thread: threading.Thread | None = None

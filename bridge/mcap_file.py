@@ -93,10 +93,8 @@ class McapSink:
         if schema is None:
             text = self._encoder.definition(topic.type_name).encode()
             schema = self._schemas[topic.type_name] = self._writer.register_schema(topic.type_name, "ros2msg", text)
-        metadata = {
-            "offered_qos_profiles": _qos_yaml(topic),
-            "topic_type_hash": self._encoder.type_hash(topic.type_name),
-        }
+        type_hash = self._encoder.type_hash(topic.type_name)
+        metadata = {"offered_qos_profiles": _qos_yaml(topic), "topic_type_hash": type_hash}
         return self._writer.register_channel(topic.name, "cdr", schema, metadata)
 
 

@@ -188,17 +188,8 @@ class Messages:
                     yield CAN_FRAMES, t_ns, encode_can_frame(t_ns, can_id, data)
             elif fd:
                 identifier, extended = _identifier(can_id)
-                payload = np.frombuffer(data, np.uint8)
-                message = self._stamped(
-                    CAN_FD_FRAMES,
-                    at_ns,
-                    "",
-                    id=identifier,
-                    is_extended=extended,
-                    is_error=False,
-                    len=len(data),
-                    data=payload,
-                )
+                fields = {"id": identifier, "is_extended": extended, "is_error": False, "len": len(data)}
+                message = self._stamped(CAN_FD_FRAMES, at_ns, "", **fields, data=np.frombuffer(data, np.uint8))
                 yield CAN_FD_FRAMES, t_ns, self.encoder.encode(CAN_FD_FRAMES.type_name, message)
 
     def _parts(self, sample: Sample) -> Iterator[tuple[Topic, int, Callable[[], Any]]]:
@@ -256,20 +247,10 @@ class Messages:
     def _cloud(self, patch: SurfacePatch) -> Any:
         points, sigma = patch.grid()
         rows = np.column_stack([points, sigma]).astype("<f4")
-        step = rows.shape[1] * 4
-        return self._stamped(
-            PATCH,
-            patch.t_ns,
-            self._object_frame,
-            height=1,
-            width=len(rows),
-            fields=self._fields,
-            is_bigendian=False,
-            point_step=step,
-            row_step=step * len(rows),
-            data=np.frombuffer(rows.tobytes(), np.uint8),
-            is_dense=bool(np.isfinite(rows).all()),
-        )
+        size = {"height": 1, "width": len(rows), "point_step": 4 * len(_PATCH_FIELDS), "row_step": rows.nbytes}
+        content = {"data": np.frombuffer(rows.tobytes(), np.uint8), "is_dense": bool(np.isfinite(rows).all())}
+        form = {"fields": self._fields, "is_bigendian": False}
+        return self._stamped(PATCH, patch.t_ns, self._object_frame, **size, **form, **content)
 
     def _curvature(self, patch: SurfacePatch) -> Any:
         """Principal curvatures κ1, κ2 as x and y, 1/m, for plots; z is their mean."""

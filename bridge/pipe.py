@@ -66,17 +66,10 @@ def pack_observation(observation: Observation, dropped: int = 0) -> bytes:
     if command is not None and (found := command.estimate) is not None:
         observed = bool(found.observed[0]), bool(found.observed[1])
         patch = SurfacePatch(t_ns, found.T_frame_contact, found.K, found.covariance, observed)
-    ahead = columns.get("explored_ahead_mm")
-    received = Received(
-        t_ns,
-        observation.measurement,
-        _number(columns.get("phase")),
-        _number(columns.get("depth_at_1n_mm")),
-        patch,
-        ahead if isinstance(ahead, np.ndarray) else None,
-        observation.frames,
-        dropped,
-    )
+    phase, depth = (_number(columns.get(name)) for name in ("phase", "depth_at_1n_mm"))
+    found_ahead = columns.get("explored_ahead_mm")
+    ahead = found_ahead if isinstance(found_ahead, np.ndarray) else None
+    received = Received(t_ns, observation.measurement, phase, depth, patch, ahead, observation.frames, dropped)
     return pickle.dumps(received, pickle.HIGHEST_PROTOCOL)
 
 
@@ -106,12 +99,9 @@ class Feed:
     """
 
     def __init__(self, fd: int, *, batch: int = 1, lossless: bool = False) -> None:
-        self.taken = 0
-        self.dropped = 0
+        self.taken = self.dropped = 0
         self.broken = False
-        self._fd = fd
-        self._batch = batch
-        self._lossless = lossless
+        self._fd, self._batch, self._lossless = fd, batch, lossless
         self._waiting: list[bytes] = []
         self._rest = memoryview(b"")
         self._leaving = 0

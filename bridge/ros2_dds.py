@@ -109,9 +109,7 @@ class Ros2Sink:
 
     def __init__(self, context: Context) -> None:
         settings, encoder = context.settings, Encoder()
-        self._plan = context.plan
-        self._send = context.send
-        self._encoder = encoder
+        self._plan, self._send, self._encoder = context.plan, context.send, encoder
         domain = domain_of(settings.ros2_domain)
         self._node = Ros2Node(domain, settings.ros2_loopback, encoder)
         self._writers = {topic.name: self._node.writer(topic) for topic in TOPICS}

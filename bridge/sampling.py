@@ -37,21 +37,18 @@ class SampleSource:
     """
 
     def __init__(self, plan: Plan) -> None:
-        arm, probe = plan.setup.arm, plan.setup.probe
-        self._health = Health(plan)
+        self._setup, self._health = plan.setup, Health(plan)
         touch = plan.setup.touch
         if isinstance(touch, Touch):
             touch = replace(touch, shape=None)  # contacts need no second moments
         self._sensing = None if touch is None else make_sensing(touch)
-        self._has_arm, self._carrier = arm is not None, plan.setup.carrier
-        self._radius = probe.radius
         # one reader: that of the contacts, or that of an array without them
         self._reader = self._sensing.reader if self._sensing is not None else make_patch_reader(plan.setup)
 
     def sample(self, received: Received) -> Sample:
         """The sample of one observation."""
         measurement, t_ns = received.measurement, received.t_ns
-        diagnostics = self._health.step(t_ns, received)
+        diagnostics, carrier = self._health.step(t_ns, received), self._setup.carrier
         sample = Sample(t_ns, frames=received.frames, diagnostics=diagnostics, dropped=received.dropped)
         if measurement is None:
             return sample
@@ -64,11 +61,11 @@ class SampleSource:
             sample,
             cycle=measurement.cycle,
             phase=_PHASES.get(received.phase) if received.phase is not None else None,
-            q=measurement.q if self._has_arm else None,
+            q=measurement.q if self._setup.arm is not None else None,
             touch=self._touch(measurement, t_ns - measurement.t_ns),
             patch=patch,
             ahead=None if received.ahead is None else 1e-3 * received.ahead,
-            T_base_carrier=None if self._carrier is None else self._carrier.frame(measurement.carrier),
+            T_base_carrier=None if carrier is None else carrier.frame(measurement.carrier),
         )
 
     def _touch(self, m: Measurement, shift_ns: int) -> TouchFrame | None:
@@ -85,7 +82,7 @@ class SampleSource:
             placed = ContactFrame(homogeneous(tangent_rotation(-contact.n_base), contact.p_base))
         force = np.zeros(3)
         if patch.force > 0.0:  # the object pushes the probe back along the direction of the contact
-            force = -patch.force * pad_to_direction(patch.u, patch.v, self._radius)
+            force = -patch.force * pad_to_direction(patch.u, patch.v, self._setup.probe.radius)
         return TouchFrame(
             t_ns=sample.t_sample_ns + shift_ns,
             counts=sample.frame.taxels if sample.frame.features is None else None,
@@ -114,7 +111,7 @@ class Health:
             return ()
         self._due_ns = t_ns + PERIOD_NS
         nodes = tuple(self._node(node, received.measurement, t_ns) for node in self._plan.nodes)
-        return (*nodes, _cell(received))
+        return (*nodes, _cell(received.measurement, received.dropped))
 
     def _node(self, node: NodeConfiguration, measurement: Measurement, t_ns: int) -> Diagnostic:
         node_id, watch = node.node_id, self._watch
@@ -144,14 +141,12 @@ class Health:
         return known_state(measurement.statuswords[arm.node_ids.index(node.node_id)])
 
 
-def _cell(received: Received) -> Diagnostic:
+def _cell(m: Measurement, dropped: int) -> Diagnostic:
     """State of the cell as a whole, with the samples that this bridge lost."""
-    m = received.measurement
-    assert m is not None
     oldest = max(m.q_age, default=0)
-    values = [("cycle", str(m.cycle)), ("oldest_tpdo_cycles", str(oldest)), ("dropped_samples", str(received.dropped))]
+    values = [("cycle", str(m.cycle)), ("oldest_tpdo_cycles", str(oldest)), ("dropped_samples", str(dropped))]
     if m.tactile_age is not None:
         values.append(("tactile_age_cycles", str(m.tactile_age)))
-    if received.dropped:
-        return Diagnostic("cell", WARN, f"this bridge lost {received.dropped} samples", tuple(values))
+    if dropped:
+        return Diagnostic("cell", WARN, f"this bridge lost {dropped} samples", tuple(values))
     return Diagnostic("cell", OK, "running", tuple(values))

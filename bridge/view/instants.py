@@ -133,12 +133,9 @@ def row_of(moment: Moment) -> tuple[float, ...]:
     nan, answer = math.nan, moment.answer
     if answer is None:
         return (moment.t_s, moment.force, *(nan,) * (len(NAMES) - 2))
-    kappa, sigmas = answer.patch.kappa, kappa_sigmas(answer.patch)
-    bands = (
-        x
-        for k, s in zip(kappa, sigmas, strict=True)
-        for x in ((k, k - 1.96 * s, k + 1.96 * s) if math.isfinite(s) else (k, nan, nan))
-    )
+    kappa, sigmas = np.array(answer.patch.kappa), np.array(kappa_sigmas(answer.patch))
+    half = np.where(np.isfinite(sigmas), 1.96 * sigmas, nan)
+    bands = np.column_stack([kappa, kappa - half, kappa + half]).ravel().tolist()
     sigma = answer.sigma if math.isfinite(answer.sigma) else nan
     return (moment.t_s, moment.force, *bands, *answer.kappa_true, answer.error, sigma)
 

@@ -74,6 +74,7 @@ def _panel_data(run: RecordedRun, times: Floats, notes: list[str]) -> dict[str, 
     moments = [run.at(t) for t in times.tolist()]
     curves = curves_of(map(row_of, moments))
     errors = deviation_scale(run.setup.truth.object, run.setup.scan)
+    colours = errors.colours(np.linspace(0, errors.high, 64))
     scene, task, sensor = run.setup.scene, run.setup.scene.task, run.setup.scene.sensor
     blank = np.zeros((1, 1) if sensor is None else (sensor.rows, sensor.columns), np.uint8)
     taxels = b"".join((blank if m.taxels is None else m.taxels).tobytes() for m in moments) if run.taxels else b""
@@ -90,11 +91,7 @@ def _panel_data(run: RecordedRun, times: Floats, notes: list[str]) -> dict[str, 
         "rows": blank.shape[0],
         "columns": blank.shape[1],
         "taxels": base64.b64encode(taxels).decode("ascii"),
-        "scale": {
-            "high": errors.high,
-            "text": errors.text,
-            "colours": errors.colours(np.linspace(0, errors.high, 64)).tolist(),
-        },
+        "scale": {"high": errors.high, "text": errors.text, "colours": colours.tolist()},
         "heat": taxel_colours(np.arange(256, dtype=np.uint8)).tolist(),
         "legend": legend_of(scene),
         "centre": place_of(run.setup).tolist(),

@@ -36,8 +36,8 @@ class Panel:
         gui = server.gui
         gui.configure_theme(control_layout="fixed", control_width="medium", show_logo=False, brand_color=(15, 110, 132))
         gui.set_panel_label(f"canprobe · {scene.name}")
-        force = scene.task.force_n if scene.task.kind in ("scan", "press") else None
-        self._target = None if isinstance(force, Mapping) else force
+        force = scene.task.force_n if scene.task.kind in ("scan", "press") else math.nan
+        self._target = math.nan if isinstance(force, Mapping) else force
         self._status = gui.add_html("")
         rows = [_KEY.format(colour, html.escape(text)) for colour, text in legend_of(scene)]
         gui.add_html(_PHONE + _STYLED.format("<br>".join([" &ensp; ".join(rows), *map(html.escape, stage.notes)])))
@@ -79,15 +79,12 @@ class Panel:
             self._taxels.image = taxel_image(moment.taxels, TAXEL_PIXELS)
         if curves is None or len(curves["t_s"]) < 2:
             return
+        times = curves["t_s"]
+        known = curves | {"target": np.full(len(times), self._target)}
         for handle, names in self._plots:
-            columns = [self._column(curves, name) for name in names]
-            handle.scales = _scales(curves["t_s"], columns)
-            handle.data = (curves["t_s"], *columns)
-
-    def _column(self, curves: Curves, name: str) -> Any:
-        if name == "target":
-            return np.full(len(curves["t_s"]), math.nan if self._target is None else self._target)
-        return curves[name]
+            columns = [known[name] for name in names]
+            handle.scales = _scales(times, columns)
+            handle.data = (times, *columns)
 
     def _lines(self, moment: Moment) -> Iterator[str]:
         force = f" · <b>{moment.force:.2f} N</b>" if math.isfinite(moment.force) else ""

@@ -78,7 +78,7 @@ class Trail:
     """Collects contacts into segments."""
 
     def __init__(self) -> None:
-        self._last: Floats | None = None
+        self._last: Floats = np.full(3, np.inf)  # no contact is joined to it
         self.segments: list[Floats] = []
         self.times: list[float] = []
 
@@ -94,9 +94,6 @@ class Trail:
             normal: outward normal (3,).
         """
         lifted = point + LIFT_M * normal
-        if self._last is None:
-            self._last = lifted
-            return False
         step = float(np.linalg.norm(lifted - self._last))
         if step < SPACING_M:
             return False

@@ -7,7 +7,6 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -34,13 +33,14 @@ ROWS_SHOWN, ANSWERS_SHOWN = 72_000, 4_000
 longer to draw, and no more memory."""
 
 
-@dataclass(frozen=True, eq=False)  # without slots: `cached_property`
+@dataclass(frozen=True, slots=True, eq=False)
 class RecordedRun:
     """The data of a run that the view shows.
 
     Attributes:
         setup: resolved scene.
         log: the columns of ``log.npz``; every row one cycle, of a long run every k-th.
+        q: joint positions (rows, n), rad or m; None without an arm.
         answer_rows: rows at which the estimator gave a new answer.
         answers: estimate at each of them.
         taxels: time, s, and counts (rows, columns) of each tactile frame, by rising time of the cycle that used it.
@@ -49,6 +49,7 @@ class RecordedRun:
 
     setup: Setup
     log: dict[str, Floats]
+    q: Floats | None
     answer_rows: NDArray[np.int64]
     answers: tuple[JudgedAnswer, ...]
     taxels: tuple[tuple[float, NDArray[np.uint8]], ...]
@@ -64,11 +65,6 @@ class RecordedRun:
         """Time of the last cycle, s."""
         return float(self.log["t_s"][-1])
 
-    @cached_property
-    def _q(self) -> Floats | None:
-        """Joint positions (rows, n), rad or m."""
-        return joint_positions(self.log)
-
     def times(self, step_s: float) -> Floats:
         """Instants at an even distance from the first cycle to the last, s."""
         start = float(self.log["t_s"][0])
@@ -76,7 +72,7 @@ class RecordedRun:
 
     def at(self, t_s: float) -> Moment:
         """The moment of an instant, with what the cell knew then."""
-        log, q = self.log, self._q
+        log, q = self.log, self.q
         row = max(int(np.searchsorted(log["t_s"], t_s + 1e-9, side="right")) - 1, 0)
         answer = int(np.searchsorted(self.answer_rows, row, side="right")) - 1
         frame = bisect_right(self.taxels, t_s + 1e-9, key=lambda item: item[0]) - 1
@@ -129,6 +125,7 @@ def read_run(folder: Path, setup: Setup | None = None) -> RecordedRun:
     return RecordedRun(
         setup=setup,
         log=log,
+        q=joint_positions(log),
         answer_rows=rows,
         answers=tuple(judge(_patch(log, row), shape) for row in rows.tolist()),
         taxels=tuple(_read_taxels(folder / run_files.TACTILE, setup)),
@@ -171,8 +168,7 @@ def _new_answers(log: dict[str, Floats]) -> NDArray[np.int64]:
         return np.empty(0, np.int64)
     key = np.concatenate([log[name].reshape(len(log["t_s"]), -1) for name in ("T_base_contact_m", "K_per_m")], axis=1)
     known = np.isfinite(log["T_base_contact_m"]).all(axis=(1, 2))
-    new = np.append(True, (key[1:] != key[:-1]).any(axis=1)) & known
-    return np.nonzero(new)[0]
+    return np.flatnonzero(np.append(True, (key[1:] != key[:-1]).any(axis=1)) & known)
 
 
 def _patch(log: dict[str, Floats], row: int) -> SurfacePatch:

@@ -28,8 +28,7 @@ def open_server(port: int, host: str = "127.0.0.1", origins: Collection[str] = (
         InterfaceError: when no port is free.
     """
     viser = needed_module("viser", "view", "the view needs viser; type:")
-    front = _front(port, host, origins)
-    try:
+    with contextlib.closing(_front(port, host, origins)) as front:
         hidden = hidden_address()
         with contextlib.redirect_stdout(io.StringIO()):  # viser greets and leaves with a box on stdout
             server = viser.ViserServer(host=hidden, port=0, label="canprobe", verbose=False)
@@ -39,8 +38,6 @@ def open_server(port: int, host: str = "127.0.0.1", origins: Collection[str] = (
         finally:
             with contextlib.redirect_stdout(io.StringIO()):
                 server.stop()
-    finally:
-        front.close()
 
 
 def _front(port: int, host: str, origins: Collection[str]) -> Front:

@@ -77,11 +77,10 @@ class Stage:
         scene, arm, array = setup.scene, setup.arm, setup.array
         self._model = None if arm is None else arm.model
         self._shape = setup.truth.object
-        self._probe = None
+        self._probe = self._taxels = None
         self._tool = np.eye(4) if scene.probe is None else T_flange_probe(scene.probe)
-        self.notes: list[str] = (
-            [] if array is None or array.newtons != NO_FORCE_REFERENCE else [f"force in {NO_FORCE_REFERENCE}"]
-        )
+        no_newtons = array is not None and array.newtons == NO_FORCE_REFERENCE
+        self.notes = [f"force in {NO_FORCE_REFERENCE}"] if no_newtons else []
         self._place, self._moved, self._met = place_of(setup), dict[int, Floats](), dict[int, float]()
         self._clock = MonotonicClock()
         self._truth: list[Any] = []
@@ -114,11 +113,8 @@ class Stage:
         api.configure_default_lights(enabled=False)
         api.configure_environment_map(None)
         api.add_light_hemisphere("/light/sky", sky_color=(255, 255, 255), ground_color=(176, 168, 156), intensity=1.6)
-        for name, place, intensity, shadow in (
-            ("sun", (-0.9, -1.2, 2.0), 2.2, True),
-            ("fill", (1.5, -0.4, 0.8), 0.9, False),
-        ):
-            api.add_light_directional(f"/light/{name}", position=place, intensity=intensity, cast_shadow=shadow)
+        api.add_light_directional("/light/sun", position=(-0.9, -1.2, 2.0), intensity=2.2, cast_shadow=True)
+        api.add_light_directional("/light/fill", position=(1.5, -0.4, 0.8), intensity=0.9, cast_shadow=False)
         api.add_grid(
             "/floor", width=1.6, height=1.6, cell_size=0.05, section_size=0.2, cell_color=(226, 229, 233),
             section_color=(200, 206, 212), plane_color=(247, 248, 250), plane_opacity=1.0, shadow_opacity=0.25,
@@ -146,8 +142,6 @@ class Stage:
                 batched_colors=linear_light(taxel_colours(blank)), batched_scales=_taxel_scales(blank),
                 opacity=0.85, side="double", cast_shadow=False, lod="off",
             )  # fmt: skip
-        else:
-            self._taxels = None
 
     def _add_contact(self) -> None:
         api = self._api

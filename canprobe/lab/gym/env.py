@@ -75,8 +75,6 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
         SceneError, PlanError: when the scene is wrong, or does not fit.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
-
     def __init__(
         self,
         scene: Scene | str | Path | None = None,
@@ -92,7 +90,6 @@ class TouchScan(gymnasium.Env[Any, NDArray[np.float32]]):
             raise UsageError(f"observation: expected one of {', '.join(KINDS)}, got {observation!r}")
         if render_mode is not None:
             raise UsageError(f"render_mode: expected None, got {render_mode!r}; record episodes and open canprobe view")
-        self.render_mode = None
         own = load_scene("cylinder", DEFAULT_SCENE) if scene is None else load_scene(scene)
         if own.task.kind != "scan":
             raise UsageError(f'scene: expected task.kind = "scan", got "{own.task.kind}"')

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,13 +13,10 @@ from canprobe.cell.scene.setup import Touch
 from canprobe.cell.tasks.from_plan import make_sensing, make_shape_tracker
 from canprobe.cell.tasks.task import Phase
 from canprobe.cell.tasks.touch import TouchTask
-from canprobe.mechanics.touch import ContactSample, Patch
+from canprobe.mechanics.touch import ContactSample, Patch, SurfaceEstimate
 from canprobe.mechanics.touch.servo import ProbePose
 from canprobe.mechanics.touch.strategies import PathFollower
 from canprobe.mechanics.types import Floats
-
-if TYPE_CHECKING:
-    from canprobe.mechanics.touch import SurfaceEstimate
 
 
 class _Heading(PathFollower):
@@ -59,8 +55,7 @@ class LedTask(TouchTask):
         super().__init__(
             plan, replace(task, duration_s=math.inf), make_sensing(task), make_shape_tracker(plan.setup, with_map=False)
         )
-        self.axes: Floats = np.asarray(task.approach.axes, dtype=float)
-        self.start: Floats = np.asarray(task.approach.start, dtype=float)
+        self.axes = task.approach.axes
         self.wanted_force = task.force
         self.top_speed = task.scan.speed
         self.velocity = 0.0, 0.0

@@ -59,16 +59,12 @@ class Observations:
             bounds |= {**_curvature("estimated_", bend), "estimated": (0.0, 1.0)}
         if kind == "oracle":
             bounds |= {"true_force_n": (0.0, force), **_where("true_", near), **_curvature("true_", bend)}
-        low, high = np.array(list(bounds.values()), dtype=np.float32).T
-        self._kind, self._shape = kind, shape
-        self._low, self._high = low, high
+        self._low, self._high = np.array(list(bounds.values()), dtype=np.float32).T
+        self._kind, self._shape, self._pad = kind, shape, task.array.pad.shape
         self.names = tuple(bounds)
-        vector = spaces.Box(low, high, dtype=np.float32)
-        taxels = spaces.Box(0.0, 1.0, task.array.pad.shape, np.float32)
-        self._pad = task.array.pad.shape
-        self.space: spaces.Space[Any] = (
-            spaces.Dict({"features": vector, "taxels": taxels}) if kind == "tactile" else vector
-        )
+        vector = spaces.Box(self._low, self._high, dtype=np.float32)
+        both = spaces.Dict({"features": vector, "taxels": spaces.Box(0.0, 1.0, self._pad, np.float32)})
+        self.space: spaces.Space[Any] = both if kind == "tactile" else vector
 
     def observe(self, episode: Episode) -> Any:
         """An element of the space: the task in contact, or as it was last, and the true state of the plant."""

@@ -87,11 +87,10 @@ def overrides_of(options: Values, rng: np.random.Generator) -> dict[str, Any]:
     Raises:
         UsageError: when there is no such set.
     """
-    options = dict(options)
-    objects = options.pop("objects", None)
-    if objects is None:
-        return {key: drawn(value, rng) for key, value in options.items()}
-    if objects not in OBJECTS:
+    values = dict(options)
+    objects = values.pop("objects", None)
+    if objects is not None and objects not in OBJECTS:
         known = ", ".join(OBJECTS)
         raise UsageError(f"objects: expected one of {known}, or None for that of the scene, got {objects!r}")
-    return {"object": OBJECTS[objects].draw(rng)} | {key: drawn(value, rng) for key, value in options.items()}
+    chosen = {} if objects is None else {"object": OBJECTS[objects]}
+    return {key: drawn(value, rng) for key, value in {**chosen, **values}.items()}

@@ -49,15 +49,9 @@ def calibrated(presses: Presses, name: str, *, own_gains: bool = True) -> ArrayF
         own_gains: whether the calibration has gains of its taxels, or is one of a make.
     """
     return calibrate_array(
-        list(presses.protocol()),
-        pad=pad_of(presses.config),
-        reference="scale",
-        reference_sigma=REFERENCE_SIGMA,
-        array=name,
-        date="",
-        made_on="study calibration",
-        own_gains=own_gains,
-    )
+        list(presses.protocol()), pad=pad_of(presses.config), reference="scale", reference_sigma=REFERENCE_SIGMA,
+        array=name, date="", made_on="study calibration", own_gains=own_gains,
+    )  # fmt: skip
 
 
 def random_array(seed: int) -> tuple[TaxelConfig, float, np.random.Generator]:
@@ -194,9 +188,7 @@ class Presses:
         rng = self._rng
         k1, k2 = sorted(rng.uniform(-12.0, 60.0, 2).tolist(), reverse=True)
         x, y = rng.uniform(-1.5e-3, 1.5e-3, 2).tolist()
-        half, force, angle = (
-            float(rng.uniform(low, high)) for low, high in ((0.0, 1.5e-3), (0.5, 3.0), (0.0, math.pi))
-        )
+        half, force, angle = rng.uniform((0.0, 0.5, 0.0), (1.5e-3, 3.0, math.pi)).tolist()
         seconds, heading = float(rng.choice(HOLD_S)), float(rng.uniform(0.0, 2.0 * math.pi))
         press = Press(force, (x, y), (half, 0.4 * half), heading, (float(rng.uniform(0.05, 0.5)),), seconds)
         return self.dwell("quadric", (k1, k2), press, angle=angle), self.forces

@@ -272,6 +272,5 @@ def _draw(axes: Axes, rows: Sequence[Row], surfaces: Sequence[str], key: str, li
                 label=f"{path}, {'inside' if inside else 'outside'}",
             )  # fmt: skip
     axes.set_xticks(range(len(surfaces)), surfaces)
-    axes.set_xlim(-0.6, len(surfaces) - 0.4)
-    axes.set_ylim(limits[0], limits[1] + 0.07 * (limits[1] - limits[0]))
+    axes.set(xlim=(-0.6, len(surfaces) - 0.4), ylim=(limits[0], limits[1] + 0.07 * (limits[1] - limits[0])))
     axes.grid(visible=False, axis="x")

@@ -175,13 +175,12 @@ class TrueGround(NamedTuple):
             np.array([curvature_tensor(foot.kappa, *foot.directions) for foot in feet]),
         )
 
-    def errors(self, found: FoundSurface) -> tuple[Floats, Floats, Floats]:
+    def errors(self, found: FoundSurface) -> tuple[Floats, ...]:
         """Errors (n,) of height, normal and curvature; what a surface does not have counts as `WORST_ERRORS`."""
         away = np.abs(found.height)
         turned = np.linalg.norm(np.cross(found.normal, self.normals), axis=1)
         bent = np.linalg.norm(found.tensor - self.tensors, axis=(1, 2))
-        a, b, c = (
+        return tuple(
             np.minimum(np.where(np.isfinite(e), e, most), most)
             for e, most in zip((away, turned, bent), WORST_ERRORS, strict=True)
         )
-        return a, b, c

@@ -59,13 +59,9 @@ class EstimatorSetting:
     def make(self, sigma_point: float, sigma_normal: float) -> Estimator:
         """Make the estimator."""
         return make_estimator(
-            self.method,
-            sigma_point=sigma_point,
-            sigma_normal=sigma_normal,
-            memory_m=self.window * STEP_M,
-            window=self.window,
-            lag=self.lag or 10,
-        )
+            self.method, sigma_point=sigma_point, sigma_normal=sigma_normal, memory_m=self.window * STEP_M,
+            window=self.window, lag=self.lag or 10,
+        )  # fmt: skip
 
 
 def settings(quick: bool = False) -> list[EstimatorSetting]:
@@ -247,13 +243,10 @@ def _draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
         line = [r for r in rows if r["method"] == method and r["lag_samples"] == lag]
         colour = METHOD_COLOURS[method]
         x = [(r["add_us"] + r["answer_us"]) * 1e-3 for r in line]
-        y = [r["error_percent"] for r in line]
+        y, low, high = (np.array([r[f"error{end}_percent"] for r in line]) for end in ("", "_low", "_high"))
         label = method if lag is None else f"{method}, lag {lag}"
         axes.plot(x, y, LAG_STYLES.get(lag, "-"), color=colour, alpha=0.8, label=label)
-        bars = [
-            [r["error_percent"] - r["error_low_percent"], r["error_high_percent"] - r["error_percent"]] for r in line
-        ]
-        axes.errorbar(x, y, yerr=np.array(bars).T, fmt="none", ecolor=colour, elinewidth=0.9)
+        axes.errorbar(x, y, yerr=(y - low, high - y), fmt="none", ecolor=colour, elinewidth=0.9)
         axes.scatter(x, y, s=[12.0 * r["window_samples"] / 40 for r in line], color=colour, zorder=3, linewidths=0)
     for r in rows:
         if r["method"] == "ml":

@@ -90,17 +90,14 @@ def errors_over_path(surface_map: SurfaceMap, samples: Sequence[ContactSample], 
     travel = PathLength(0.2e-3)
     path = np.array([travel.total for sample in samples if travel.add(sample.p_base) is not None])
     seconds = np.array([sample.t_s for sample in samples]) - samples[0].t_s
-    found: dict[str, list[float]] = {key: [] for key in ("path", "seconds", *LIMITS)}
-    taken = 0
+    names, rows, taken = ("path", "seconds", *LIMITS), list[Any](), 0
     for mark in np.arange(MARK_M, min(path[-1], LONGEST_M) + MARK_M, MARK_M):
         until = int(np.searchsorted(path, mark, side="right"))
         surface_map.add_samples(samples[taken:until])
         taken = until
         errors = truth.errors(evaluate_map(surface_map, truth.points))
-        values = (path[until - 1], seconds[until - 1], *(error.mean() for error in errors))
-        for column, value in zip(found.values(), values, strict=True):
-            column.append(float(value))
-    return found
+        rows.append((path[until - 1], seconds[until - 1], *(error.mean() for error in errors)))
+    return dict(zip(names, np.array(rows).reshape(-1, len(names)).T.tolist(), strict=True))
 
 
 def path_to(scan: Mapping[str, Any], key: str, limit: float, over: str = "path") -> float | None:
@@ -117,12 +114,11 @@ def paths_of(scans: Sequence[Mapping[str, Any]], key: str) -> Floats:
 
 def row_of(name: str, scans: Sequence[Mapping[str, Any]]) -> Row:
     """Means of a strategy over the shapes."""
-    row: Row = {"strategy": name}
-    for key in LIMITS:
-        row[f"{key}_mm"] = 1e3 * float(paths_of(scans, key).mean())
     reached = [path_to(scan, key, limit) is not None for scan in scans for key, limit in LIMITS.items()]
     times = [path_to(scan, "height", LIMITS["height"], "seconds") for scan in scans]
-    return row | {
+    return {
+        "strategy": name,
+        **{f"{key}_mm": 1e3 * float(paths_of(scans, key).mean()) for key in LIMITS},
         "reached": f"{sum(reached)} of {len(reached)}",
         "height_s": float(np.mean([SECONDS if t is None else t for t in times])),
         "force_percent": float(np.mean([scan["force_percent"] for scan in scans])),

@@ -82,15 +82,13 @@ def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> Row:
     noticed = [one["noticed_ms"] for one in runs if one["noticed_ms"] is not None]
     stopped = [one for one in runs if one["reason"]]
     left = [one["left_n"] for one in runs if one["left_n"] > PRESSED_N]
+    by_task = {task: [one["force_max_n"] for one in runs if one["task"] == task] for task in TASKS}
     return {
         "fault": name,
         "runs": len(runs),
         "force_max_n": worst["force_max_n"],
         "worst": f"{worst['task']}, {worst['phase']}, {worst['plant']}",
-        **{
-            f"{task}_n": max((one["force_max_n"] for one in runs if one["task"] == task), default=None)
-            for task in TASKS
-        },
+        **{f"{task}_n": max(forces, default=None) for task, forces in by_task.items()},
         "above_ms": max(one["above_ms"] for one in runs),
         "noticed_ms": float(np.median(noticed)) if noticed else None,
         "noticed_max_ms": max(noticed, default=None),

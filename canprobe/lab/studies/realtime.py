@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -57,10 +57,9 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Measure; minutes of real time, or half a minute with `quick`."""
     check_interface(vcan_cells.CHANNEL)
     say = sweep.say
-    measured = []
     scan_s, bare_s, hold_s = (4.0, 1.0, 1.0) if quick else (300.0, 100.0, 10.0)
     say(f"the whole controller at 400 Hz, {scan_s:g} s")
-    measured.append(measure_scan(scan_s))
+    measured = [measure_scan(scan_s)]
     say(f"a loop at 400 Hz that does nothing, {bare_s:g} s")
     measured.append(measure_bare(bare_s))
     for mode in MODES:
@@ -70,15 +69,14 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     return StudyResult("realtime", [_row(m) for m in measured], findings(measured), facts, draw, COLUMNS)
 
 
-def _climb(mode: TactileModeName, seconds: float, rates_hz: Iterable[float], say: Say) -> list[Measured]:
+def _climb(mode: TactileModeName, seconds: float, rates_hz: Iterable[float], say: Say) -> Iterator[Measured]:
     """Rising rates, until one loses a tenth of its cycles."""
-    climbed = []
     for rate_hz in rates_hz:
         say(f"hold with {mode} at {rate_hz:g} Hz, {seconds:g} s")
-        climbed.append(measure_hold(mode, rate_hz, seconds))
-        if climbed[-1].ended or climbed[-1].held_hz < 0.9 * rate_hz:
-            break
-    return climbed
+        held = measure_hold(mode, rate_hz, seconds)
+        yield held
+        if held.ended or held.held_hz < 0.9 * rate_hz:
+            return
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,20 +207,11 @@ def _measured(case: str, scene: Scene, make: Callable[[Plan], Controller]) -> Me
             ended = str(error)
     cycle, drives = session.cell.cycle, session.cell.drives
     assert cycle is not None and drives is not None
-    seconds = cycle.t_ns * 1e-9
+    times, seconds = cycle.statistics, cycle.t_ns * 1e-9
     return Measured(
-        case,
-        scene.sensor.mode,
-        scene.cycle.rate_hz,
-        cycle.statistics.period_error_ns,
-        seconds,
-        cycle.statistics.response_ns,
-        cycle.statistics.compute_ns,
-        latency_ns,
-        drives.missed,
-        processor_share(used_s, seconds),
-        ended,
-    )
+        case, scene.sensor.mode, scene.cycle.rate_hz, times.period_error_ns, seconds, times.response_ns,
+        times.compute_ns, latency_ns, drives.missed, processor_share(used_s, seconds), ended,
+    )  # fmt: skip
 
 
 def processor_share(used_before_s: float, passed_s: float) -> float | None:
@@ -235,12 +224,7 @@ def processor_share(used_before_s: float, passed_s: float) -> float | None:
 def _row(m: Measured) -> Row:
     times_ns = {"lateness": m.lateness_ns, "response": m.response_ns, "compute": m.compute_ns, "latency": m.latency_ns}
     return {
-        "case": m.case,
-        "sensor": m.sensor,
-        "rate_hz": m.rate_hz,
-        "held_hz": m.held_hz,
-        "cycles": m.cycles,
-        "overruns": m.overruns,
+        **{name: getattr(m, name) for name in ("case", "sensor", "rate_hz", "held_hz", "cycles", "overruns")},
         "overruns_per_10000": m.per_10000,
         "missed_pdos": m.missed,
         **{f"{name}_{what}_us": us for name, ns in times_ns.items() for what, us in percentiles(ns).items()},

@@ -79,19 +79,16 @@ class Held(NamedTuple):
 
 def hold(session: Session, seconds: float) -> Held:
     """Hold the cell for a time."""
-    begin: list[tuple[int, int]] = []
-    cycles = 0
+    # overruns and missed answers at each cycle: those before the first are not of the hold
+    seen: list[tuple[int, int]] = []
 
     def counts() -> tuple[int, int]:
         cell = session.cell
         return cell.cycle.statistics.overruns if cell.cycle is not None else 0, cell.drives.missed if cell.drives else 0
 
     def step(_: Measurement) -> Command:
-        nonlocal cycles
-        if not begin:
-            begin.append(counts())
-        cycles += 1
-        return Command(done=cycles * session.plan.sync.period_ns * 1e-9 >= seconds)
+        seen.append(counts())
+        return Command(done=len(seen) * session.plan.sync.period_ns * 1e-9 >= seconds)
 
     ended = ""
     try:
@@ -99,8 +96,8 @@ def hold(session: Session, seconds: float) -> Held:
             session.run(step)
     except CanprobeError as error:
         ended = str(error)
-    overruns, missed = (now - then for now, then in zip(counts(), begin[0], strict=True)) if begin else (0, 0)
-    return Held(overruns / max(1, cycles), missed, ended)
+    overruns, missed = (now - then for now, then in zip(counts(), seen[0], strict=True)) if seen else (0, 0)
+    return Held(overruns / max(1, len(seen)), missed, ended)
 
 
 def measure(seed: int) -> dict[str, Any]:

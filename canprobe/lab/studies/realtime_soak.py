@@ -98,12 +98,8 @@ def watched() -> Iterator[int]:
     """`canprobe monitor` with a terminal of its own, which gets what the others leave; its process id."""
     shown, terminal = pty.openpty()
     words = ["monitor", "cylinder", "--bus", "socketcan", "--channel", CHANNEL]
-    monitor = subprocess.Popen(
-        ["nice", "-n", "19", sys.executable, "-m", "canprobe", *words],
-        stdin=subprocess.DEVNULL,
-        stdout=terminal,
-        start_new_session=True,
-    )
+    command = ["nice", "-n", "19", sys.executable, "-m", "canprobe", *words]
+    monitor = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=terminal, start_new_session=True)
     os.close(terminal)
     readers = []
     try:

@@ -99,8 +99,7 @@ def draw_runs(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
     with picture(path, "Time from the last return of what was lost to the hold", 3.0) as figure:
         axes = figure.subplots()
         axes.hist([run["late_s"] for run in runs if run["back"]], bins=40, color=BLUE)
-        axes.set_xlabel("s")
-        axes.set_ylabel("runs")
+        axes.set(xlabel="s", ylabel="runs")
 
 
 class LockstepRun(RecoverRun):

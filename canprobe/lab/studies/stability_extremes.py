@@ -280,6 +280,7 @@ def draw_extremes(rows: Sequence[Row], path: Path) -> None:
         f"right: true force within {FORCE_PERCENT:g} % of its target; curvature within a tenth of κ + 1/R_p or within"
         " what is stated, or not observed"
     )
+    longest = max(len(values) for values, *_ in EXTREMES.values())
     with picture(path, title, 1.8 + 0.62 * len(names)) as figure:
         panels = figure.subplots(1, 2, sharey=True)
         for axes, task in zip(panels, ("press", "scan"), strict=True):
@@ -290,12 +291,7 @@ def draw_extremes(rows: Sequence[Row], path: Path) -> None:
                     axes.plot(column, line, marker, color=colour, markersize=7)
                     text = row["value"].split()[0]
                     axes.annotate(text, (column, line), textcoords="offset points", xytext=(0, -15), ha="center")
-            axes.set(
-                title=task,
-                xticks=[],
-                ylim=(len(names) - 0.35, -0.5),
-                xlim=(-0.6, max(len(v) for v, *_ in EXTREMES.values()) - 0.4),
-            )
+            axes.set(title=task, xticks=[], ylim=(len(names) - 0.35, -0.5), xlim=(-0.6, longest - 0.4))
             axes.grid(visible=False)
         units = {name: form.partition(" ")[2] for name, (_, form, _) in EXTREMES.items()}
         panels[0].set_yticks(range(len(names)), [f"{n} ({units[n]})" if units[n] else n for n in names])

@@ -99,9 +99,8 @@ def measure(case: SurfaceCase) -> dict[str, Any]:
         touch = setup.task
         assert isinstance(touch, Touch) and touch.scan is not None
         if case.strategy != "explore":
-            touch = replace(
-                touch, scan=replace(touch.scan, strategy=exploration.fixed(case.strategy), name=case.strategy)
-            )
+            scan = replace(touch.scan, strategy=exploration.fixed(case.strategy), name=case.strategy)
+            touch = replace(touch, scan=scan)
         try:
             plan = make_plan(replace(setup, task=touch))
         except PlanError as refusal:

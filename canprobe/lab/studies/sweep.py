@@ -37,7 +37,7 @@ import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -133,11 +133,8 @@ def open_sweep(folder: Path, *, workers: int | None = None, fresh: bool = False,
     Raises:
         StudyError: another process uses the folder.
     """
-    store = CellStore(folder, fresh=fresh)
-    try:
+    with closing(CellStore(folder, fresh=fresh)) as store:
         yield Sweep(partial(process_pool, workers), store, **watched)
-    finally:
-        store.close()
 
 
 def _compute(measure: Callable[[Any], object], parts: tuple[str, ...], model: str, cell: Any) -> str:
@@ -186,12 +183,8 @@ def process_pool(workers: int | None = None) -> Iterator[Executor]:
         workers: number of processes; one for each core that this process may use by default.
     """
     before = set(multiprocessing.active_children())
-    pool = _DeafPool(
-        workers or system.processors(),
-        multiprocessing.get_context("spawn"),
-        initializer=_begin,
-        initargs=(os.getpid(),),
-    )
+    spawn = multiprocessing.get_context("spawn")
+    pool = _DeafPool(workers or system.processors(), spawn, initializer=_begin, initargs=(os.getpid(),))
     try:
         yield pool
     except BaseException:

@@ -156,9 +156,8 @@ def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Floats]:
         targets.append(np.rint(joints_to_units(arm, q)))
     counts = np.array(targets)
     start = units_to_joints(arm, counts[0])  # a posture that the encoders can hold
-    return PlantConfig(
-        arm, start, object=shape, stiffness_n_m3=stiffness_n_m3, fidelity="dynamic", bodies=bodies
-    ), counts
+    config = PlantConfig(arm, start, object=shape, stiffness_n_m3=stiffness_n_m3, fidelity="dynamic", bodies=bodies)
+    return config, counts
 
 
 def integrated(stiffness_n_m3: float, targets: Floats, dynamics: Dynamics, *, held: bool = True) -> Floats | None:
