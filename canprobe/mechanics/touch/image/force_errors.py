@@ -40,6 +40,11 @@ BEYOND_SIGMA = 0.05
 15 N by a calibration up to 3 N forces are 1 to 6 % too small for each, by the window and the form of a large patch."""
 
 
+def faint_share(lightness: float) -> float:
+    """Share of the force of a touch that the threshold may hide, for the level over its peak pressure."""
+    return max(lightness - FAINT_LIGHTNESS, 0.0) ** 2
+
+
 def upper_end(force: float, sigma: float) -> float:
     """Upper end of a force with a standard deviation, both in N: the true force is above it once in fifty."""
     return force + UPPER_SIGMAS * sigma
@@ -50,9 +55,10 @@ class ForceSigma(NamedTuple):
 
     Attributes:
         reference: the reference of newtons; 0 where there is none, and newtons are nominal.
-        array: gains, hysteresis, threshold, form of the patch, and drift since the tare.
+        array: gains, hysteresis, form of the patch, and drift since the tare.
         creep: what the creep correction leaves.
-        taxels: what taxels that do not measure or bend off and the pad's edge hide; infinite for a lower bound.
+        taxels: what taxels that do not measure or bend off, the threshold, and the edges of pad and window hide;
+            infinite for a lower bound.
     """
 
     reference: float = 0.0
@@ -101,6 +107,7 @@ class ForceErrors:
         peak: float = 0.0,
         bridged: float = 0.0,
         cut: float = 0.0,
+        faint: float = 0.0,
         age_s: float = 0.0,
     ) -> ForceSigma:
         """Standard deviation of a measured force.
@@ -115,20 +122,18 @@ class ForceErrors:
             peak: peak pressure over full scale.
             bridged: share of the force that is interpolated over taxels that do not measure.
             cut: 1 where the patch reaches the pad's edge, else the pressure at the window's edge over the peak.
+            faint: share of the force that the threshold may hide (`faint_share`).
             age_s: time since the tare, s.
         """
-        light = (
-            self.array * math.sqrt(max(lightness / USUAL_LIGHTNESS, 1.0)),
-            max(lightness - FAINT_LIGHTNESS, 0.0) ** 2,
-        )
+        light = self.array * math.sqrt(max(lightness / USUAL_LIGHTNESS, 1.0))
         drift = DRIFT_SIGMA * (1.0 - math.exp(-age_s / DRIFT_S))
         bent = min(max(peak - STRAIGHT_SHARE, 0.0) / (1.0 - STRAIGHT_SHARE), 1.0)
         late = force * late_decades * math.hypot(self.creep, self.creep_sigma)
         return ForceSigma(
             reference * force,
-            force * math.hypot(*light, drift, self.spread, BEYOND_SIGMA * self.beyond(force)),
+            force * math.hypot(light, drift, self.spread, BEYOND_SIGMA * self.beyond(force)),
             math.hypot(self.creep_sigma * creep_n, late),
-            force * math.hypot(BRIDGED_SIGMA * bridged, BENT_SIGMA * bent, CUT_SIGMA * cut),
+            force * math.hypot(BRIDGED_SIGMA * bridged, BENT_SIGMA * bent, CUT_SIGMA * cut, faint),
         )
 
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from canprobe.mechanics.touch.image.force_creep import ForceCreep
-from canprobe.mechanics.touch.image.force_errors import ForceSigma
+from canprobe.mechanics.touch.image.force_errors import ForceSigma, faint_share
 from canprobe.mechanics.touch.image.patch import Patch, PatchCalibration
 from canprobe.mechanics.touch.stops import TOUCH_FORCE
 
@@ -40,15 +40,17 @@ class ForceReading:
         shown = creep.step(t_s, patch.force, touching=patch.force >= TOUCH_FORCE / 2)
         # newtons rest on touches that had crept by so many decades: their creep is in the gains
         force = shown * (1.0 + errors.creep * errors.creep_decades)
+        lightness = self._pad.lightness(patch.peak_pa)
         sigma = errors.sigma(
             force,
-            self._pad.lightness(patch.peak_pa),
+            lightness,
             creep.decades_n - errors.creep_decades * shown,
             creep.late_decades,
             reference=self._reference,
             peak=patch.peak_pa / self._pad.full_scale_pa,
             bridged=patch.bridged,
             cut=1.0 if patch.cut_by_pad else patch.cut_by_window,
+            faint=faint_share(lightness),
             age_s=t_s - self._began_s,
         )
         if patch.saturated or patch.off_pad:

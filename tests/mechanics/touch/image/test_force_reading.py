@@ -74,7 +74,7 @@ def test_a_faint_touch_a_cut_patch_and_time_since_the_tare_make_a_force_doubtful
     reading = ForceReading(CALIBRATION)
     sigma = reading.step(0.0, PATCH).sigma
     faint = ForceReading(CALIBRATION).step(0.0, PATCH._replace(peak_pa=5e3)).sigma  # the level is 2.35 kPa
-    assert faint.array > 0.07 * 2.0 > 5.0 * sigma.array
+    assert faint.taxels > 0.07 * 2.0 > 5.0 * sigma.array
     cut = ForceReading(CALIBRATION).step(0.0, PATCH._replace(cut_by_window=0.6)).sigma
     assert (cut.taxels, sigma.taxels) == (pytest.approx(0.03 * 2.0, rel=0.1), 0.0)
     later = reading.step(60.0, PATCH).sigma
