@@ -104,9 +104,10 @@ class LedTask(TouchTask):
         dx, dy, more = float(velocity[0]) - vx, float(velocity[1]) - vy, force - self.targets["target_force_n"]
         self._change, self._left = (dx / cycles, dy / cycles, more / cycles), cycles
 
-    def _feel(self, sample: TactileSample, patch: Patch) -> None:
-        super()._feel(sample, patch)
+    def _feel(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
+        contact = super()._feel(sample, patch)
         self._newest = self._contact or self._newest
+        return contact
 
     def _leader(self, contact: ContactSample) -> tuple[PathFollower, Floats]:
         return self._heading, contact.p_base

@@ -65,6 +65,22 @@ def test_the_same_seed_gives_the_same_trace_and_another_one_another(make):
     assert np.array_equal(goes_on[0], trace()[0])
 
 
+def test_an_array_that_repeats_its_image_ends_an_episode_before_it_presses(make, monkeypatch):
+    env = make()
+    env.reset(seed=1)
+    frozen, plant = [], env.episode.session.buses.world.plant
+    image_of = plant.array.image_of
+    monkeypatch.setattr(
+        plant.array, "image_of", lambda *a: frozen[0] if frozen else frozen.append(image_of(*a)) or frozen[0]
+    )
+    terminated, forces = False, []
+    while not terminated:
+        _, _, terminated, truncated, info = env.step(np.array([0.3, 0.0, 1.0], dtype=np.float32))
+        assert not truncated
+        forces.append(info["force_n"])
+    assert "the array has sent the same image" in info["reason"] and max(forces) < 6.0
+
+
 def test_an_action_moves_the_contact_in_its_tangent_plane(make):
     env = make(observation="oracle", estimate=False)
     env.reset(seed=1, options={"object.radius_mm": 60, "task.speed_mm_s": 40})
