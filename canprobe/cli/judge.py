@@ -1,13 +1,14 @@
 """Judge a CANopen master by what it sends: known faults of masters, each a rule on the frames of the bus.
 
-With --eds each file is an emulated node, with a SCENE or a cell its nodes are; COMMAND is your master, which is started
-once they are served, with no input, and its output goes into a file. Without COMMAND a master that runs elsewhere is
-awaited, and Ctrl-C ends the judgement. With --record a log is judged for what can be seen in it,
-also one of motors that speak no CANopen (--motor).
+With --eds each file is an emulated node, with a SCENE or a cell its nodes are, and with --motor a motor that speaks no
+CANopen; COMMAND is your master, which is started once they are served, with no input, and its output goes into a file.
+Without COMMAND a master that runs elsewhere is awaited, and Ctrl-C ends the judgement. With --record a log is judged
+for what can be seen in it.
 
 Once a drive has been enabled for two seconds, faults are thrown at it, one after the other, and the reaction is judged:
-slow SDO answers, a lost heartbeat, a mute node, a fault of the drive, a reboot. --inject names others, and --passive
-throws none. Your master never drives anything real here, as long as no real node is on the same bus.
+slow SDO answers, a lost heartbeat, a mute node, a fault of the drive, a reboot; at a motor: silence, a rotor that is
+too hot, its watchdog, a brown-out. --inject names others, and --passive throws none. Your master never drives anything
+real here, as long as no real node is on the same bus.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from canprobe.fieldbus.eds.description import Description
     from canprobe.fieldbus.tools.judge import Judge
     from canprobe.fieldbus.tools.judge.bench import MasterBench
+    from canprobe.fieldbus.tools.judge.seen_motor import SeenMotor
 
 HELP = "judge a CANopen master by what it sends"
 EXAMPLE = """\
@@ -47,6 +49,7 @@ examples:
   canprobe judge puma560 --channel vcan0 --inject "node 3: mute on enabled for 2 s" -- ./bring_up
   canprobe judge --eds drive.eds --node-id 5 --record candump.log --html judge.html
   canprobe judge free --record runs/free/bus.log
+  canprobe judge --motor damiao:dm4310 --id 1 --mst-id 0x11 --channel vcan0 -- python my_master.py
   canprobe judge --motor damiao:dm4310 --id 1 --mst-id 0x11 --record candump.log
   canprobe judge --list
 """
@@ -99,8 +102,6 @@ def run(args: argparse.Namespace) -> int:
     if args.inject and args.passive:
         raise UsageError("judge: --inject throws faults, and --passive throws none; choose one")
     args.older = read_baseline(args)
-    if args.motor and args.record is None:
-        raise UsageError("judge: masters of motors are judged by a log: serve motors with `canprobe emulate --motor …`")
     return _judge_served(args) if args.record is None else _judge_record(args)
 
 
@@ -109,15 +110,11 @@ def _judge_record(args: argparse.Namespace) -> int:
         if getattr(args, option):
             name = "COMMAND" if option == "command" else f"--{option}"
             raise UsageError(f"judge: {name} belongs to served nodes, not to --record")
-    from canprobe.fieldbus.motor.on_bus import motors_on_bus
-    from canprobe.fieldbus.motor.protocol import Rid
     from canprobe.fieldbus.tools.judge import Judge, nodes_of, read_record
-    from canprobe.fieldbus.tools.judge.seen_motor import SeenMotor
 
     channel = one_channel(args, "judge: a log is judged for one channel: --channel CH")
     nodes = _descriptions(args, channel)
-    made = motors_on_bus(args.motor, args.id, args.mst_id, nodes)
-    motors = [SeenMotor(one.node_id, int(one.registers[Rid.MST_ID]), one.ranges) for one in made]
+    motors = _motors(args, nodes)
     judge = Judge(nodes, bitrate=args.bitrate or 1_000_000, without=args.without, motors=motors)
     judge.hear(read_record(args.record, channel))
     known = any(node.seen or node.addressed for node in judge.bus.nodes.values())
@@ -129,6 +126,16 @@ def _judge_record(args: argparse.Namespace) -> int:
     report = judge.report(f"the master in {args.record}", facts, log=str(args.record))
     _print(args, report)
     return report.exit_status
+
+
+def _motors(args: argparse.Namespace, nodes: Nodes) -> list[SeenMotor]:
+    """What is known of each motor of the command line before its first frame."""
+    from canprobe.fieldbus.motor.on_bus import motors_on_bus
+    from canprobe.fieldbus.motor.protocol import Rid
+    from canprobe.fieldbus.tools.judge.seen_motor import SeenMotor
+
+    made = motors_on_bus(args.motor, args.id, args.mst_id, nodes)
+    return [SeenMotor(one.node_id, int(one.registers[Rid.MST_ID]), one.ranges) for one in made]
 
 
 def _no_such_node(args: argparse.Namespace, asked: Iterable[int], found: Sequence[int]) -> str:
@@ -159,7 +166,7 @@ def _judge_served(args: argparse.Namespace) -> int:
             output.unlink()
     if bench.command is not None and output.exists():
         args.report.say(f"output of {args.command[0]}: {output}")
-    judge = bench.judged(nodes, target.bitrate, args.without)
+    judge = bench.judged(nodes, target.bitrate, args.without, _motors(args, nodes))
     if args.log is not None:
         write_log(bench.record(), args.log, target.channel)
     report = _report_of(args, bench, judge, nodes, target)
@@ -183,7 +190,10 @@ def _server(args: argparse.Namespace, bench: MasterBench, nodes: Nodes) -> tuple
         target = real_target(args, channel)
         files = eds_files("judge", args)
         positions = [start_position(node) for node in nodes.values()]
-        return target, lambda: emulate_eds(files, target, positions=positions, observer=bench, say=args.report.say)
+        motors = (args.motor, args.id, args.mst_id)
+        return target, lambda: emulate_eds(
+            files, target, positions=positions, motors=motors, observer=bench, say=args.report.say
+        )
     from canprobe import api
 
     scene = loaded(args)
@@ -235,8 +245,9 @@ def _report_of(
         if bench.command.output.exists():
             facts["output of the master"] = str(bench.command.output)
     thrown = bench.thrown()
+    found = first_answers(bench.record(), thrown, nodes, _motors(args, nodes))
     times = []
-    for number, (one, answer) in enumerate(zip(thrown, first_answers(bench.record(), thrown, nodes), strict=True), 1):
+    for number, (one, answer) in enumerate(zip(thrown, found, strict=True), 1):
         text = "no answer"
         if answer is not None:
             times.append((answer.t_ns - one.begin_ns) * 1e-6)
@@ -247,7 +258,9 @@ def _report_of(
     if times:
         report.distributions["first answer to a fault"] = tuple(times)
     left = bench.injections.not_thrown if bench.injections is not None else []
-    report.left_out += [(f"fault {text}", "no drive was enabled for two seconds before the end") for text in left]
+    report.left_out += [
+        (f"fault {text}", "no drive or motor was enabled for two seconds before the end") for text in left
+    ]
     return report
 
 

@@ -170,3 +170,22 @@ def test_the_nodes_of_a_scene_are_served(group, capsys):
     told = capsys.readouterr()
     assert "serving nodes 1, 2, 3, 4, 5, 6" in told.err and "no master was heard" in told.err
     assert "n/a    enable    01 target at enable" in told.out
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize(
+    ("place", "fault", "found"),
+    [
+        ("0.0", "motor 1: over-temperature on enabled", {"50 status passed over"}),
+        ("held", "motor 1: brown-out on enabled for 100 ms", set()),
+    ],
+)
+@pytest.mark.usefixtures("group")
+def test_a_master_of_a_motor_is_judged_while_it_runs(place, fault, found, tmp_path, capsys):
+    motor = ("--motor", "damiao:dm4310", "--id", "1", "--mst-id", "0x11", "--inject", fault, "--json")
+    master = (sys.executable, str(SMALL.with_name("motor_master.py")), place, "4")
+    assert main(["judge", *motor, "--output", str(tmp_path / "out.txt"), "--", *master]) == bool(found)
+    document = json.loads(capsys.readouterr().out)
+    assert {row["name"] for row in document["rows"] if row["verdict"] == "FAIL"} == found
+    assert document["facts"]["fault 1"].startswith(f"motor 1: {fault.split()[2]}")
+    assert not (tmp_path / "out.txt").exists() or (tmp_path / "out.txt").read_text() == ""

@@ -100,11 +100,13 @@ class FaultSpan:
 
     Attributes:
         fault: the fault.
+        name: name of the node or motor.
         begin_ns: its beginning.
         end_ns: its end; `FOREVER_NS` while it holds.
     """
 
     fault: Fault
+    name: str
     begin_ns: int
     end_ns: int = FOREVER_NS
 
@@ -112,7 +114,7 @@ class FaultSpan:
     def text(self) -> str:
         """Node, kind and values of the fault."""
         given = "".join(f" {name}={value:g}" for name, value in self.fault.values.items())
-        return f"node {self.fault.node_id}: {self.fault.kind.name}{given}"
+        return f"{self.name}: {self.fault.kind.name}{given}"
 
 
 def number_text(name: str, value: float) -> str:
@@ -204,7 +206,7 @@ class Effect:
         self.fault, self.host, self.node = fault, host, host.node
         self.rng = Random(fault.seed)
         self.end_ns = fault.end_ns
-        self.span = FaultSpan(fault, fault.start_ns)
+        self.span = FaultSpan(fault, host.node.name, fault.start_ns)
         self.left = fault.hits
 
     def begin(self, t_ns: int) -> Sequence[Frame] | None:

@@ -84,7 +84,9 @@ class FaultyNodes:
             now_ns: present time on that clock.
         """
         spans = sorted((span for node in self.nodes for span in node.spans), key=attrgetter("begin_ns"))
-        return [FaultSpan(one.fault, one.begin_ns - start_ns, min(one.end_ns, now_ns) - start_ns) for one in spans]
+        return [
+            replace(one, begin_ns=one.begin_ns - start_ns, end_ns=min(one.end_ns, now_ns) - start_ns) for one in spans
+        ]
 
 
 @contextmanager

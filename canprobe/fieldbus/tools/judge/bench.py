@@ -21,11 +21,13 @@ from canprobe.fieldbus.eds.description import Description
 from canprobe.fieldbus.protocol.cia402 import DriveCommand, command_of
 from canprobe.fieldbus.protocol.frames import Frame
 from canprobe.fieldbus.tools.faults import FaultSpan, FaultyNodes
+from canprobe.fieldbus.tools.faults.motor_faults import FaultyMotor
 from canprobe.fieldbus.tools.judge.bus_frame import BusFrame
 from canprobe.fieldbus.tools.judge.bus_state import BusState
 from canprobe.fieldbus.tools.judge.events import ControlSeen, NmtSeen, RequestSeen
 from canprobe.fieldbus.tools.judge.injections import Injections
 from canprobe.fieldbus.tools.judge.judging import Judge
+from canprobe.fieldbus.tools.judge.seen_motor import MotorSeen, SeenMotor
 from canprobe.fieldbus.tools.judge.seen_node import SeenNode
 
 _AFTER_NS = 500_000_000
@@ -36,6 +38,8 @@ _HABIT_NS = 1_000_000_000
 """Time without a request after which the next one is something else than before."""
 _START = 100_000
 """Place of a drive at first, counts, where its limits do not ask for less."""
+_START_RAD = 0.3
+"""Place of a motor that speaks no CANopen at first."""
 _FORCES = ((0.0, signal.SIGINT), (5.0, signal.SIGTERM), (7.0, system.KILL))
 """Signals that end a command, and after how many seconds each is sent."""
 
@@ -151,6 +155,9 @@ class MasterBench:
     def begin(self, nodes: FaultyNodes, now_ns: int) -> None:
         """Start the command and the faults."""
         self._begin_ns = now_ns
+        for node in nodes.nodes:
+            if isinstance(node, FaultyMotor):
+                node.motor.joint.q = _START_RAD
         self.injections = Injections(nodes, self._faults, now_ns)
         if self._words:
             self.command = MasterCommand(self._words, self._output)
@@ -192,10 +199,16 @@ class MasterBench:
         """The faults that held, with times from the beginning."""
         return self.injections.thrown(self._begin_ns) if self.injections is not None else []
 
-    def judged(self, nodes: Mapping[int, Description], bitrate: int, without: Collection[int] = ()) -> Judge:
+    def judged(
+        self,
+        nodes: Mapping[int, Description],
+        bitrate: int,
+        without: Collection[int] = (),
+        motors: Sequence[SeenMotor] = (),
+    ) -> Judge:
         """The frames, judged."""
         spans = [(one.begin_ns, one.end_ns) for one in self.thrown()]
-        judge = Judge(nodes, served=True, bitrate=bitrate, charges_ns=spans, without=without)
+        judge = Judge(nodes, served=True, bitrate=bitrate, charges_ns=spans, without=without, motors=motors)
         return judge.hear(self.record(), self._last_ns - self._begin_ns)
 
 
@@ -219,20 +232,23 @@ def write_log(frames: Sequence[BusFrame], path: Path, channel: str) -> None:
 
 
 def first_answers(
-    frames: Sequence[BusFrame], thrown: Sequence[FaultSpan], nodes: Mapping[int, Description]
+    frames: Sequence[BusFrame],
+    thrown: Sequence[FaultSpan],
+    nodes: Mapping[int, Description],
+    motors: Sequence[SeenMotor] = (),
 ) -> list[BusFrame | None]:
     """The first frame after each fault by which the master does something else than before; None without one.
 
     It counts up to the next fault, and up to five seconds after the fault's end: an NMT command, a controlword with
-    another command, or an SDO request to a node that had none for a second.
+    another command, an SDO request to a node that had none for a second, or a special command to a motor.
     """
-    bus = BusState(nodes, served=True)
+    bus = BusState(nodes, served=True, motors=motors)
     answers: list[BusFrame | None] = [None] * len(thrown)
     commands: dict[SeenNode, DriveCommand | None] = {}  # the last one to each node
     asked_ns: dict[SeenNode, int] = {}
     for frame in frames:
         for event in bus.take(frame):
-            new = isinstance(event, NmtSeen)
+            new = isinstance(event, NmtSeen) or (isinstance(event, MotorSeen) and event.special is not None)
             if isinstance(event, RequestSeen):
                 new = event.node not in asked_ns or frame.t_ns - asked_ns[event.node] > _HABIT_NS
                 asked_ns[event.node] = frame.t_ns

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 
 from canprobe.errors import UsageError
+from canprobe.fieldbus.motor.protocol import MotorStatus
 from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
 from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.fieldbus.tools.faults import FaultSpan, FaultyNode, FaultyNodes
+from canprobe.fieldbus.tools.faults.motor_faults import FaultyMotor
 
 STANDARD_FAULTS = (
     "sdo-slow ms=200 for 2 s",
@@ -18,6 +20,8 @@ STANDARD_FAULTS = (
     "reboot for 200 ms",
 )
 """The standard sequence, from what a master may bear to what it must bring up anew."""
+STANDARD_MOTOR_FAULTS = ("mute for 2 s", "over-temperature for 2 s", "watchdog-trip for 100 ms", "brown-out for 100 ms")
+"""The same for motors that speak no CANopen."""
 _CALM_NS = 2_000_000_000
 """Time for which the nodes must have been at work before the next fault."""
 
@@ -36,7 +40,9 @@ class Injections:
 
     def __init__(self, nodes: FaultyNodes, faults: Sequence[str] | None, now_ns: int) -> None:
         self._nodes = nodes
-        self.not_thrown = list(STANDARD_FAULTS) if faults is None else []
+        motors_alone = all(isinstance(node, FaultyMotor) for node in nodes.nodes)
+        standard = STANDARD_MOTOR_FAULTS if motors_alone else STANDARD_FAULTS
+        self.not_thrown = list(standard) if faults is None else []
         self._calm_ns: int | None = None
         self._now_ns = now_ns
         for text in faults or ():
@@ -58,14 +64,22 @@ class Injections:
             self._calm_ns = now_ns
         elif now_ns - self._calm_ns >= _CALM_NS:
             with suppress(UsageError):  # the node is no drive, which this kind needs
-                self._nodes.inject(f"node {at_work.node_id}: {self.not_thrown.pop(0)}", now_ns)
+                kind = "motor" if isinstance(at_work, FaultyMotor) else "node"
+                self._nodes.inject(f"{kind} {at_work.node_id}: {self.not_thrown.pop(0)}", now_ns)
                 self._calm_ns = None
 
 
-def _at_work(nodes: Iterable[FaultyNode]) -> FaultyNode | None:
-    """The first node that does what it is for: a drive that is enabled, or without drives a node in operational."""
-    drives = [node for node in nodes if node.node.dictionary.has_index(0x6041)]
+def _at_work(nodes: Sequence[FaultyNode]) -> FaultyNode | None:
+    """The first node that does what it is for: a drive that is enabled, or without drives a node in operational.
+
+    Where there are no nodes, the first motor that is enabled.
+    """
+    others = [node for node in nodes if not isinstance(node, FaultyMotor)]
+    if not others:
+        motors = (node for node in nodes if isinstance(node, FaultyMotor))
+        return next((motor for motor in motors if motor.motor.status is MotorStatus.ENABLED), None)
+    drives = [node for node in others if node.node.dictionary.has_index(0x6041)]
     if not drives:
-        return next((node for node in nodes if node.node.state is NmtState.OPERATIONAL), None)
+        return next((node for node in others if node.node.state is NmtState.OPERATIONAL), None)
     words = {node: node.node.dictionary.number(0x6041) for node in drives}
     return next((node for node in drives if known_state(words[node]) is DriveState.OPERATION_ENABLED), None)

@@ -29,7 +29,7 @@ def kick(case: Case, motor: SeenMotor) -> Watch[MotorSeen]:
         case.expect(motor, pull <= most and not unread, what, motor.shown, event)
 
 
-@rule(50)
+@rule(50, answers=True)
 def fault_passed_over(case: Case, motor: SeenMotor) -> Watch[MotorSeen]:
     """Commands go on to a motor whose status is a fault."""
     while event := (yield):
@@ -39,7 +39,7 @@ def fault_passed_over(case: Case, motor: SeenMotor) -> Watch[MotorSeen]:
             case.blame(motor, f"commands go on at {status_name(motor.answer.status)}", motor.shown, event)
 
 
-@rule(51)
+@rule(51, answers=True)
 def silence_passed_over(case: Case, motor: SeenMotor) -> Watch[MotorSeen]:
     """Commands go on to a motor that does not answer."""
     while event := (yield):
@@ -47,7 +47,7 @@ def silence_passed_over(case: Case, motor: SeenMotor) -> Watch[MotorSeen]:
             case.blame(motor, f"{motor.unanswered} commands without an answer", motor.shown, event)
 
 
-@rule(52)
+@rule(52, answers=True)
 def other_ranges(case: Case, motor: SeenMotor) -> Watch[MotorSeen]:
     """The motor has said that its ranges are others than those of the type by which its master scales."""
     told = False
