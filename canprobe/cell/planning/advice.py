@@ -7,7 +7,6 @@ from collections.abc import Container, Iterator, Sequence
 
 from canprobe.cell.planning.array import cut_patch, measured_share, patch_across_taxels, support_of
 from canprobe.cell.planning.bridges import BRIDGES
-from canprobe.cell.planning.contact import highest_known_force
 from canprobe.cell.planning.free_parameters import MODES
 from canprobe.cell.planning.model import PlannedPdo
 from canprobe.cell.scene.geometry import mesh_warnings
@@ -196,6 +195,8 @@ def _calibration_warnings(array: Array, setup: Setup) -> Iterator[str]:
         if array.raw is not None:
             same = f'; or, if it is that one: sensor.serial_number = "{its}"'
         if (touch := setup.touch) is not None:
+            from canprobe.cell.planning.contact import highest_known_force  # only where something is touched
+
             limit = setup.limits.force_max
             highest = highest_known_force(array, touch.probe, limit, (0.0, touch.duration_s))
             usable = f", so that {at_most(highest)} N may be at limits.force_max_n = {limit:g}"
@@ -246,7 +247,7 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
 def _beyond_what_is_known(task: Touch | Calibrate) -> Iterator[str]:
     """Warnings of a force that the calibration has not seen, and of a speed beyond those that settings rest on."""
     from canprobe.mechanics.touch.image.force_errors import BEYOND_SIGMA
-    from canprobe.mechanics.touch.online.regions import FASTEST_M_S, beyond_factor
+    from canprobe.mechanics.touch.online.beyond import FASTEST_M_S, beyond_factor
 
     errors = task.array.calibration.force
     if more := errors.beyond(task.force):

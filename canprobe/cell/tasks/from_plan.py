@@ -86,7 +86,7 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
 def _stages(task: Touch, memory: float, scan: Scan) -> Iterator[AnswerStage]:
     """The stages of a task's answers, in order."""
     from canprobe.mechanics.touch import MapFusion, NoiseLevel, PatchCurvature, PatchFusion, SystematicErrors
-    from canprobe.mechanics.touch.online.regions import beyond_factor
+    from canprobe.mechanics.touch.online.beyond import beyond_factor
 
     assert task.shape is not None
     if _uses_patch(task):

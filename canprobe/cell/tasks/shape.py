@@ -9,6 +9,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -16,7 +17,6 @@ import numpy as np
 from canprobe.cell.scene.plugins import Plugin
 from canprobe.errors import CanprobeError, UsageError
 from canprobe.mechanics.touch.estimate.estimator import Estimator, Steps, at_once
-from canprobe.mechanics.touch.estimate.path_length import PathLength
 
 if TYPE_CHECKING:
     from canprobe.mechanics.touch import ContactSample, SurfaceEstimate, SurfaceMap
@@ -79,13 +79,16 @@ class ShapeTracker:
     """
 
     def __init__(self, estimator: Estimator, every: int, surface_map: SurfaceMap | None = None) -> None:
+        from canprobe.mechanics.touch.estimate.path_length import PathLength  # only where a shape is asked for
+
         self.records: list[ShapeRecord] = []
         self.samples: deque[ContactSample] = deque(maxlen=SAMPLES_KEPT)
         self.travelled_m = 0.0
         self.restarts = self.withheld = 0
         self.doubted = False
         self._estimator = estimator
-        self._path_length = PathLength(PATH_STEP_M)
+        self._new_path = partial(PathLength, PATH_STEP_M)
+        self._path_length = self._new_path()
         self._every = max(1, every)
         self._map = surface_map
         self._waiting: deque[tuple[ContactSample, float]] = deque()  # with the path up to each
@@ -101,7 +104,7 @@ class ShapeTracker:
         if self.samples and sample.t_s - self.samples[-1].t_s > GAP_S:
             self._estimator.reset()
             self._waiting.clear()
-            self._path_length = PathLength(PATH_STEP_M)
+            self._path_length = self._new_path()
             self._taken, self._found, self._steps = self._added, None, self._work()
         self.travelled_m += self._path_length.add(sample.p_base)
         self._added += 1

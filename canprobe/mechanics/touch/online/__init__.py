@@ -15,6 +15,7 @@ changes, `regions` where its errors do.
     systematic_errors   errors that no path averages: lag, scale, tool, pad
     map_fusion          ground that was touched before
     regions             changes of an answer's covariance, and the list of what widens a region
+    beyond              forces and speeds that neither calibration nor settings have seen
 
 Start reading at `estimator`, then `regions`.
 """

@@ -17,7 +17,7 @@ region of curvature holds, in the order in which it comes in:
 5. The level of the innovations, a factor: `noise_level`. Source: Birge, Phys. Rev. 40, 1932.
 6. Lag of the answer behind slow changes of curvature and quick ones, scale, error of the tool, drag of the pad, each
    an error that is added: `systematic_errors`.
-7. A force above those of the calibration and a speed above those of the settings, a factor: `beyond_factor`.
+7. A force above those of the calibration and a speed above those of the settings, a factor: `beyond`.
 8. Ground that was touched before narrows it, less where the curvature changes there: `map_fusion`.
 9. An array that is not as its calibration says, a factor: `FOREIGN_ARRAY_FACTOR`, once `CalibrationCheck` has found it.
 """
@@ -37,16 +37,6 @@ from canprobe.mechanics.types import Floats
 FOREIGN_ARRAY_FACTOR = 2.0
 """Factor of the standard deviations of curvature of an array that is not as its calibration says, from a development
 draw of study `regions`."""
-BEYOND_FACTOR = 0.6
-"""Growth of the standard deviations with the logarithm of a force or a speed over the greatest one that is known: from
-scans of spheres and planes with 5 to 15 N, and from 37 scans of a development draw with 40 to 100 mm/s."""
-FASTEST_M_S = 0.04
-"""Greatest speed of the scans from which settings were taken, m/s."""
-
-
-def beyond_factor(beyond: float, speed: float) -> float:
-    """Factor of the standard deviations of curvature for a `ForceErrors.beyond`, and a speed of the contact, m/s."""
-    return (1.0 + BEYOND_FACTOR * beyond) * (1.0 + BEYOND_FACTOR * math.log(max(speed / FASTEST_M_S, 1.0)))
 
 
 def scaled(answer: SurfaceEstimate, factor: float) -> SurfaceEstimate:

@@ -55,7 +55,7 @@ class SystematicErrors(AnswerStage):
         drag: error of the way of a contact over the pad, over this way, one standard deviation (`drag_errors`).
         offset: error of the probe's centre along the normal while the probe turns with the surface, m, one standard
             deviation.
-        wider: factor of all standard deviations at last (`regions.beyond_factor`).
+        wider: factor of all standard deviations at last (`beyond_factor`).
     """
 
     def __init__(

@@ -5,7 +5,8 @@ import pytest
 
 from canprobe.mechanics.touch import ContactSample, SystematicErrors, fit_surface
 from canprobe.mechanics.touch.estimate.noise import CHI2_95
-from canprobe.mechanics.touch.online.regions import BEYOND_FACTOR, FASTEST_M_S, beyond_factor, with_errors
+from canprobe.mechanics.touch.online.beyond import BEYOND_FACTOR, FASTEST_M_S, beyond_factor
+from canprobe.mechanics.touch.online.regions import with_errors
 from canprobe.mechanics.touch.online.systematic_errors import LAGS
 
 MEMORY = 0.02
