@@ -72,7 +72,7 @@ class ShapeTracker:
     Attributes:
         records: the answers; of more than `RECORDS_KEPT` every second, every fourth and so on.
         samples: the contacts; of more than `SAMPLES_KEPT` the last ones.
-        travelled_m: path of the contact, m.
+        travelled_m: path of the contact without its noise, m; up to a dozen contacts behind, for which it is a mean.
         restarts: how often the estimator diverged and started afresh.
         withheld: answers that could not be computed: of a matrix that is singular or not definite.
         doubted: whether images mean another curvature than the calibration says, so that regions are wider.

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.results.picture import BLUE, GREEN, GREY, INK, ORANGE, PINK, SKY, legend, log_scale, picture
+from canprobe.cell.tasks.shape import PATH_STEP_M
 from canprobe.lab.studies.drawn_shapes import LENGTH_MM, WIDTH_MM, TrueGround
 from canprobe.lab.studies.result import Row, drawn_anew, interval_of
 from canprobe.lab.studies.surface_methods import evaluate_map
@@ -87,7 +88,7 @@ def fixed(name: str) -> Strategy:
 
 def errors_over_path(surface_map: SurfaceMap, samples: Sequence[ContactSample], truth: TrueGround) -> dict[str, Any]:
     """Mean errors after every `MARK_M` of the path of contacts, and the time at which each was walked."""
-    travel = PathLength(0.2e-3)
+    travel = PathLength(PATH_STEP_M)
     path = np.array([travel.total for sample in samples if travel.add(sample.p_base) is not None])
     seconds = np.array([sample.t_s for sample in samples]) - samples[0].t_s
     names, rows, taken = ("path", "seconds", *LIMITS), list[Any](), 0

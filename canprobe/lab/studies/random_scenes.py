@@ -154,12 +154,12 @@ def random_scene(seed: int, folder: Path) -> DrawnScene:
     if group != "shipped":
         config, stiffness, _ = own_array(seed)
         array, sensor = _emulated(seed), replace(sensor, full_scale_kpa=1e-3 * config.full_scale_pa)
-        own = group == "calibrated"
-        fit = calibrated(Presses(*own_array(seed)), f"emulated, seed {seed}") if own else None
-        calibration = load_calibration(EMULATED_ARRAY) if fit is None else fit.calibration
+        calibration, serial = load_calibration(EMULATED_ARRAY), 2
+        if group == "calibrated":
+            calibration, serial = calibrated(Presses(*own_array(seed)), f"emulated, seed {seed}").calibration, 1
         file = folder / "calibration.toml"
         file.write_text(dump_calibration(replace(calibration, serial_number=1)), encoding="utf-8")
-        sensor = replace(sensor, calibration=str(file), serial_number=1 if own else 2)
+        sensor = replace(sensor, calibration=str(file), serial_number=serial)
     scene = replace(
         base,
         scene=replace(base.scene, name=f"random-{seed}", seed=seed),

@@ -79,6 +79,19 @@ def test_noise_is_no_path():
     assert tracker.travelled_m == pytest.approx(20e-3, rel=0.05)
 
 
+def test_an_answer_has_the_path_up_to_its_contact():
+    tracker = ShapeTracker(Counting(), every=2)
+    paths = {}
+    for k in range(121):  # a contact of 25 mm/s every second cycle
+        cycle(tracker, 2.5e-3 * k, contacts=[2.5e-3 * k] if k % 2 == 0 else ())
+        paths[2.5e-3 * k] = tracker.travelled_m
+    assert len(tracker.records) == 30
+    assert all(record.travelled_m == paths[record.t_s] for record in tracker.records)
+    late = tracker.records[-1]
+    assert late.reported_s > late.t_s and late.travelled_m > 5e-3
+    assert late.travelled_m == pytest.approx(25e-3 * late.t_s, abs=13 * 0.125e-3)  # a dozen contacts behind
+
+
 class NotedStage(AnswerStage):
     """A stage whose work is a step by itself, and is noted."""
 

@@ -74,7 +74,7 @@ class FaultyNode(Participant):
         self._pending.append(fault)
         self._busy = True
         if fault.event:
-            self._before = self._events()
+            self._before = self.states
 
     def remove(self, fault: Fault) -> None:
         """End a fault at the next frame or deadline of the node; nothing happens where it is over."""
@@ -187,7 +187,7 @@ class FaultyNode(Participant):
         out = [*sent, *said, *(frame for effect in self._effects for frame in effect.watch(t_ns))]
         if any(fault.event for fault in self._pending):
             booted = any(can_id == HEARTBEAT_BASE + self.node_id and data == b"\0" for can_id, data in frames)
-            now = self._events()
+            now = self.states
             new = (now - self._before) | ({"boot-up"} if booted else set()) | ({"sync"} if synchronised else set())
             self._before = now
             for fault in [one for one in self._pending if one.event in new]:
@@ -195,7 +195,13 @@ class FaultyNode(Participant):
                 out += self._begin(fault, t_ns)
         return out
 
-    def _events(self) -> frozenset[str]:
+    @property
+    def is_drive(self) -> bool:
+        """Whether it can be enabled."""
+        return self.node.dictionary.has_index(0x6041)
+
+    @property
+    def states(self) -> frozenset[str]:
         """States of the node that are events when it comes into them."""
         enabled = state_of(self.node.dictionary.number(0x6041)) is DriveState.OPERATION_ENABLED
         operational = self.node.state is NmtState.OPERATIONAL

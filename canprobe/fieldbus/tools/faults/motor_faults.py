@@ -29,7 +29,12 @@ class FaultyMotor(FaultyNode):
         super().__init__(cast(SlaveNode, motor))  # these kinds ask for no service that only a node has
         self.motor = motor
 
-    def _events(self) -> frozenset[str]:
+    @property
+    def is_drive(self) -> bool:
+        return True
+
+    @property
+    def states(self) -> frozenset[str]:
         return frozenset({"enabled"} if self.motor.status is MotorStatus.ENABLED else ())
 
 

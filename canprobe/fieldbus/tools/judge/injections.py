@@ -6,9 +6,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from canprobe.errors import UsageError
-from canprobe.fieldbus.motor.protocol import MotorStatus
-from canprobe.fieldbus.protocol.cia402 import DriveState, known_state
-from canprobe.fieldbus.protocol.frames import NmtState
 from canprobe.fieldbus.tools.faults import FaultSpan, FaultyNode, FaultyNodes
 from canprobe.fieldbus.tools.faults.motor_faults import FaultyMotor
 
@@ -40,8 +37,9 @@ class Injections:
 
     def __init__(self, nodes: FaultyNodes, faults: Sequence[str] | None, now_ns: int) -> None:
         self._nodes = nodes
-        motors_alone = all(isinstance(node, FaultyMotor) for node in nodes.nodes)
-        standard = STANDARD_MOTOR_FAULTS if motors_alone else STANDARD_FAULTS
+        others = [node for node in nodes.nodes if not isinstance(node, FaultyMotor)]
+        self._targets = others or nodes.nodes  # of the standard sequence
+        standard = STANDARD_FAULTS if others else STANDARD_MOTOR_FAULTS
         self.not_thrown = list(standard) if faults is None else []
         self._calm_ns: int | None = None
         self._now_ns = now_ns
@@ -57,29 +55,18 @@ class Injections:
         self._now_ns = now_ns
         if not self.not_thrown or any(node.holding for node in self._nodes.nodes):
             return
-        at_work = _at_work(self._nodes.nodes)
+        at_work = _at_work(self._targets)
         if at_work is None:
             self._calm_ns = None
         elif self._calm_ns is None:
             self._calm_ns = now_ns
         elif now_ns - self._calm_ns >= _CALM_NS:
             with suppress(UsageError):  # the node is no drive, which this kind needs
-                kind = "motor" if isinstance(at_work, FaultyMotor) else "node"
-                self._nodes.inject(f"{kind} {at_work.node_id}: {self.not_thrown.pop(0)}", now_ns)
+                self._nodes.inject(f"{at_work.name}: {self.not_thrown.pop(0)}", now_ns)
                 self._calm_ns = None
 
 
 def _at_work(nodes: Sequence[FaultyNode]) -> FaultyNode | None:
-    """The first node that does what it is for: a drive that is enabled, or without drives a node in operational.
-
-    Where there are no nodes, the first motor that is enabled.
-    """
-    others = [node for node in nodes if not isinstance(node, FaultyMotor)]
-    if not others:
-        motors = (node for node in nodes if isinstance(node, FaultyMotor))
-        return next((motor for motor in motors if motor.motor.status is MotorStatus.ENABLED), None)
-    drives = [node for node in others if node.node.dictionary.has_index(0x6041)]
-    if not drives:
-        return next((node for node in others if node.node.state is NmtState.OPERATIONAL), None)
-    words = {node: node.node.dictionary.number(0x6041) for node in drives}
-    return next((node for node in drives if known_state(words[node]) is DriveState.OPERATION_ENABLED), None)
+    """The first node that does what it is for: a drive that is enabled, or without drives a node in operational."""
+    wanted = "enabled" if any(node.is_drive for node in nodes) else "operational"
+    return next((node for node in nodes if wanted in node.states), None)

@@ -122,7 +122,8 @@ class ForceErrors:
             peak: peak pressure over full scale.
             bridged: share of the force that is interpolated over taxels that do not measure.
             cut: 1 where the patch reaches the pad's edge, else the pressure at the window's edge over the peak.
-            faint: share of the force that the threshold may hide (`faint_share`).
+            faint: share of the force that the threshold may hide (`faint_share`); not taken from `lightness`, as a plan
+                has that of a layer, which a flat array does not have.
             age_s: time since the tare, s.
         """
         light = self.array * math.sqrt(max(lightness / USUAL_LIGHTNESS, 1.0))

@@ -41,6 +41,8 @@ draw of study `regions`."""
 
 def scaled(answer: SurfaceEstimate, factor: float) -> SurfaceEstimate:
     """An answer whose standard deviations of curvature are `factor` times as large."""
+    if factor == 1.0:
+        return answer
     f, evidence, root = factor, answer.evidence, answer.model_root
     covariance = answer.covariance * f**2
     return replace(
